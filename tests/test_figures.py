@@ -5,15 +5,17 @@ import sys
 import warnings
 import xml.etree.ElementTree as ET
 from dataclasses import replace
-from itertools import combinations, pairwise
+from itertools import combinations
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import PathPatch
 from matplotlib.text import Text
 from PIL import Image
 from sample_flights import drifting, swarm
@@ -25,7 +27,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.plotting import curves, sketches, space, style
-from rigidfleet.plotting.solids import convex_rim
+from rigidfleet.plotting.solids import seen_from_above
 from rigidfleet.result import LABELS, VARIABLES, PhaseRecord, Result
 from rigidfleet.result.quantities import samples
 from rigidfleet.solids.outline import outline
@@ -203,41 +205,31 @@ def by_gid(figure: Any, gid: str) -> list[Any]:
     return figure.findobj(lambda artist: artist.get_gid() == gid)
 
 
-def struck(figure: Any) -> list[str]:
-    """Words inside axes that a line, a band or other words run through, as the picture is drawn."""
+def covering(figure: Any) -> list[str]:
+    """Words above axes that leave the page, or stand on other axes, names of phases or other words."""
     figure.draw_without_rendering()
     found = []
     for ax in figure.axes:
-        labels = [
-            t for t in ax.texts if t.get_text() and t.get_visible() and t.get_gid() != "phase"
-        ]
-        for text in labels:
+        others = [other for other in figure.axes if other is not ax]
+        rest = [
+            *(other.bbox for other in others), ax.bbox,
+            *(t.get_window_extent() for x in figure.axes for t in x.texts if t.get_gid() == "phase"),
+            *(t.get_window_extent() for x in others for t in by_gid(x, "words") if t.get_text()),
+            *(other.xaxis.label.get_window_extent() for other in others if other.get_xlabel()),
+        ]  # fmt: skip
+        for text in by_gid(ax, "words"):
             box = text.get_window_extent()
-            x, y = [np.linspace(*ends, 60) for ends in zip(*box.corners()[[0, 3]], strict=True)]
-            for line in ax.lines:
-                # Sampled every half a pixel or so, which the code under test does not do.
-                p = line.get_transform().transform(np.column_stack(line.get_data(orig=False)))
-                if line.get_linestyle() == "None":
-                    q = p
-                else:
-                    steps = [
-                        np.linspace(a, b, 2 + int(min(4000, 2 * np.abs(b - a).max())))
-                        for a, b in pairwise(p) if np.isfinite([a, b]).all()
-                    ]  # fmt: skip
-                    q = np.concatenate([np.zeros((0, 2)), *steps])
-                inside = (q > [x[0], y[0]]) & (q < [x[-1], y[-1]])
-                if inside.all(axis=1).any():
-                    found.append(f"{text.get_text()!r} by a line")
-            for other in labels:
-                if other is not text and overlap(
-                    box.corners(), other.get_window_extent().corners()
-                ):
-                    found.append(f"{text.get_text()!r} by {other.get_text()!r}")
+            if text.get_text() and any(box.overlaps(other) for other in rest):
+                found.append(text.get_text())
+            if not figure.bbox.padded(1.0).fully_containsx(box.x0):
+                found.append(f"{text.get_text()}: off the page")
     return found
 
 
 def texts(figure: Any) -> list[str]:
-    return [text.get_text() for text in figure.findobj(Text) if text.get_visible()]
+    """All that is written; what stands above axes in its parts."""
+    written = [text.get_text() for text in figure.findobj(Text) if text.get_visible()]
+    return [part for words in written for part in words.replace("\n", " ").split("  ·  ")]
 
 
 @pytest.fixture(scope="module")
@@ -472,7 +464,7 @@ def test_clearance_shows_limits_and_the_worst(triangle):
     assert sorted(x.get_ydata()[0] for x in by_gid(figure, "limit")) == [0.0, 0.5, 1.0]
     k = int(triangle.separation.argmin())
     i, j = sorted(triangle.separation_pair[k] + 1)
-    words = f"{triangle.separation[k]:.3g} m at {triangle.time[k]:.2f} s, agents {i} and {j}"
+    words = f"least {triangle.separation[k]:.3g} m at {triangle.time[k]:.2f} s, agents {i} and {j}"
     assert words in texts(plotting.clearance(triangle))
     k = int(triangle.clearance.argmin())
     thing = triangle.mission.obstacles[triangle.clearance_obstacle[k]].name
@@ -492,23 +484,19 @@ def near_a_limit(share: float, *, level: float) -> Result:
 @pytest.mark.parametrize("level", [0.05, 0.6, 1.5, 3.0])
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.76, 1.0])
 @pytest.mark.parametrize("name", ["clearance", "summary"])
-def test_no_line_runs_through_words(name, share, level):
-    """Least values and names of limits stand clear of curves, limits and each other, wherever the least one is."""
-    figure = getattr(plotting, name)(near_a_limit(share, level=level))
-    if name == "summary":  # its views in space are pictures, not curves
-        for ax in figure.axes[:2]:
-            ax.remove()
-    assert struck(figure) == []
+def test_words_cover_nothing(name, share, level):
+    """Least values and limits are told above the axes, clear of curves, phases and each other."""
+    assert covering(getattr(plotting, name)(near_a_limit(share, level=level))) == []
 
 
 @pytest.mark.parametrize("top", [9.9, 12.0, 22.0, 23.4, 30.0])
-def test_no_curve_runs_through_words_of_forces(top):
-    """Peaks and limits are told where no curve runs, whether thrust is far below its limit, at it, or above."""
+def test_words_of_forces_cover_nothing(top):
+    """Peaks and limits are told above the axes, whether thrust is far below its limit, at it, or above."""
     t = np.linspace(0.0, 20.0, 181)[:, None]
     thrust = 9.8 + (top - 9.8) * np.abs(np.sin(t + [0.0, 0.4, 1.1]))
-    assert struck(plotting.inputs(a_flight(thrust=thrust))) == []
+    assert covering(plotting.inputs(a_flight(thrust=thrust))) == []
     pull = (thrust - 9.8)[:, :, None] * [1.0, 0.0, 0.0]
-    assert struck(plotting.constraint_force(a_flight(constraint_force=pull))) == []
+    assert covering(plotting.constraint_force(a_flight(constraint_force=pull))) == []
 
 
 def test_a_force_that_is_rounding_is_told_in_words():
@@ -668,18 +656,18 @@ def test_shape_error_is_that_of_the_worst_pair():
     np.testing.assert_allclose(curves.shape_error(grown), 0.4)
 
 
-def test_thinned_lines_keep_their_peaks():
-    """Of 200,000 samples a few thousand are drawn, with the ends and the single sample that peaks."""
-    t = np.linspace(0, 90, 200_000)
-    y = np.sin(t)
-    y[[77_777, 123_456]] = 100.0, -100.0
-    x, z = style.thin_out(t, y)
-    assert len(x) < 4000
-    assert (np.diff(x) > 0).all()
-    assert (x[0], x[-1]) == (t[0], t[-1])
-    assert (z.max(), z.min()) == (100.0, -100.0)
-    assert style.thin_out(t[:100], y[:100])[0] is not None
-    np.testing.assert_array_equal(style.thin_out(t[:100], y[:100])[1], y[:100])
+def test_many_samples_are_light_and_keep_their_peaks():
+    """Of 20,001 samples an SVG has what can be seen of them, with the single sample that peaks."""
+    thrust = np.full((20_001, 3), 9.8) + 0.1 * np.sin(np.linspace(0, 90, 20_001))[:, None]
+    thrust[7_777, 1] = 20.0
+    flight = a_flight(samples=20_001, thrust=thrust)
+    (svg,) = plotting.render_figure(flight, "inputs", ["svg"]).values()
+    assert len(svg) < 200_000
+    (path,) = [e for e in ET.fromstring(svg).iter() if e.get("id") == "agent-2"][:1]
+    (curve,) = [e.get("d", "") for e in path.iter() if e.tag.endswith("}path")]
+    heights = np.array([float(y) for y in re.findall(r"[ML] \S+ (\S+)", curve)])
+    usual = np.median(heights)
+    assert usual - heights.min() > 20 * (heights.max() - usual)
 
 
 def test_a_flight_that_breaks_down_is_still_readable():
@@ -848,14 +836,24 @@ def test_the_figure_of_an_operator():
 
 
 @pytest.mark.parametrize("name", ["statue", "bridge-inspection", "narrow-passage"])
-def test_the_rim_of_an_obstacle_is_its_hull(name):
-    """From above, obstacles are drawn by the corners of the convex hull that Qhull finds."""
+def test_an_obstacle_seen_from_above_covers_its_hull(name):
+    """What is painted of a convex obstacle from above is as large as the hull that Qhull finds, without holes."""
     for thing in load_mission(name).solids:
-        flat = np.clip(outline(thing.solid).triangles, -100.0, 100.0).reshape(-1, 3)[:, :2]
-        rim, hull = convex_rim(flat), flat[ConvexHull(flat).vertices]
-        assert len(rim) == len(hull)
-        first = int(np.linalg.norm(hull - rim[0], axis=1).argmin())
-        assert rim == pytest.approx(np.roll(hull, -first, axis=0), abs=1e-8)
+        faces = np.clip(outline(thing.solid).triangles, -100.0, 100.0)
+        hull = ConvexHull(faces.reshape(-1, 3)[:, :2])
+        figure = Figure(figsize=(4, 4), dpi=100)
+        ax = figure.add_axes(
+            (0, 0, 1, 1), xlim=hull.min_bound[:1].tolist() + hull.max_bound[:1].tolist()
+        )
+        ax.set_ylim(hull.min_bound[1], hull.max_bound[1])
+        ax.axis("off")
+        ax.add_patch(PathPatch(seen_from_above(faces), facecolor="black", linewidth=0))
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        painted = np.mean(1.0 - np.asarray(canvas.buffer_rgba())[..., 0] / 255)
+        assert painted * np.prod(hull.max_bound - hull.min_bound) == pytest.approx(
+            hull.volume, rel=0.01
+        )
 
 
 # -- files
@@ -955,6 +953,8 @@ def test_a_figure_fits_its_column(triangle, tmp_path, width):
             page, flat = figure.bbox.padded(1.0), [ax for ax in figure.axes if ax.name != "3d"]
             shown: list[Any] = [*figure.texts, *figure.legends, *(ax.get_legend() for ax in flat)]
             shown += [ax.xaxis.label for ax in flat] + [ax.yaxis.label for ax in flat]
+            spatial: list[Any] = [ax for ax in figure.axes if ax.name == "3d"]
+            shown += [ax.zaxis.label for ax in spatial]
             for part in shown:
                 if part is not None and (not isinstance(part, Text) or part.get_text()):
                     box = part.get_window_extent()
@@ -984,21 +984,11 @@ def test_the_legend_of_a_trajectory_covers_nothing(n, width):
 
 
 @pytest.mark.parametrize("width", [80.0, 88.0, 130.0])
-def test_words_at_a_point_are_on_the_page(width):
-    """Wherever the least clearance of a flight is, what is written beside it is in its axes."""
-    result = a_flight(n=12, samples=41, formation=None)
-    apart = np.linspace(2.0, 3.0, len(result.time))
-    for k in range(0, len(apart), 4):
-        dip = apart.copy()
-        dip[k] = -0.228
-        with style.figure_options(width=width):
-            figure, ((ax,),) = style.time_figure(result, "Clearance", 1)
-            ax.plot(result.time, dip)
-            at = style.places_around(result.time[k], dip[k])
-            style.annotate(ax, f"-0.228 m at {result.time[k]:.2f} s, agents 11 and 12", at)
-            style.place_annotations(figure)
-        box = ax.texts[-1].get_window_extent()
-        assert ax.bbox.x0 - 1 <= box.x0 < box.x1 <= ax.bbox.x1 + 1
+def test_words_above_axes_are_on_the_page(width):
+    """However narrow a figure is, what is written above its axes is on the page and covers nothing."""
+    result = a_flight(n=12, samples=41, formation=None, mission=FENCED)
+    for figure in plotting.plot(result, names=["clearance", "inputs"], width=width):
+        assert covering(figure) == []
 
 
 @pytest.mark.parametrize("width", [0.0, -88.0, 79.0, 401.0, math.nan])
@@ -1186,13 +1176,13 @@ def line_of(ax: Any, agent: int) -> np.ndarray:
 
 
 def test_rotors_of_one_model_stand_beside_their_limit():
-    """Each vehicle's greatest rotor is drawn in newtons with the limit; below, all rotors of the one nearest to it."""
+    """Each vehicle's greatest rotor is drawn as a share of its limit; below, all rotors of the one nearest to it."""
     result = by_quadrotors(["px4-sih"] * 3)
     above, below = drawn("rotors", result).axes
     for i in range(3):
-        assert line_of(above, i + 1).max() == pytest.approx((0.3 + 0.1 * i) * 5.0)
-    assert [line.get_ydata()[0] for line in by_gid(above, "limit")] == [pytest.approx(5.0)]
-    assert "limit 5 N" in texts(above)
+        assert line_of(above, i + 1).max() == pytest.approx(30.0 + 10.0 * i)
+    assert [line.get_ydata()[0] for line in by_gid(above, "limit")] == [pytest.approx(100.0)]
+    assert "limit" in texts(above)
     assert below.get_ylabel() == "rotors of agent 3 [N]"
     assert [line.get_ydata().max() for line in below.lines[:4]] == pytest.approx(
         [1.5, 1.5, 2.5, 1.5]

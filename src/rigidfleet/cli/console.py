@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 _WIDE = 1000
 #: Time between lines of progress if there is no terminal for a progress bar [s].
 _SELDOM = 10.0
-#: Time between pictures of a progress bar: animated; and without a thread, at least [s].
-_FRAME, _OFTEN = 0.1, 0.5
+#: Least time between pictures of a progress bar that no thread draws [s].
+_OFTEN = 0.5
 #: Time between lines of progress of a check [s].
 _PATIENCE = 5.0
 #: A flight reports its progress several times a second. Without a report for this time, it is compiling [s].
@@ -131,13 +131,13 @@ def print_sheet(sheet: Sheet) -> None:
 class _Screen:
     """Progress display: animated on a terminal, otherwise a line from time to time."""
 
+    animated = True  # by a thread of rich's
+
     def __init__(self) -> None:
         self.console = err()
         self.progress: Progress | None = None
         self.begun = self.shown_at = perf_counter()
         self.cold = False
-        self.still = threading.Event()
-        self.animation = threading.Thread(target=self._animate, daemon=True)
 
     def __enter__(self) -> Self:
         if self.console.is_interactive:
@@ -151,27 +151,15 @@ class _Screen:
                 progress.TaskProgressColumn(),
                 progress.TextColumn("{task.fields[screen]}", markup=False, table_column=Column()),
             )
-            look: dict[str, Any] = {"transient": True, "auto_refresh": False}
+            look: dict[str, Any] = {"transient": True, "auto_refresh": self.animated}
             self.progress = progress.Progress(*columns, console=self.console, **look)
             self.task = self.progress.add_task("", total=None, screen=self)
             self.progress.start()
-            self.animation.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         if self.progress is not None:
-            self.stop_animation()
             self.progress.stop()
-
-    def stop_animation(self) -> None:
-        """Draw only what is shown from now on, without a thread."""
-        self.still.set()
-        if self.animation.is_alive():
-            self.animation.join()
-
-    def _animate(self) -> None:
-        while not self.still.wait(_FRAME) and self.progress is not None:
-            self.progress.refresh()
 
     def announce_compilation(self) -> None:
         """Announce that the simulator will be compiled, in several parts during the flight."""
@@ -188,7 +176,7 @@ class _Screen:
         """Show the progress; without animation as a line, if the last line was long ago."""
         if self.progress is not None:
             self.progress.update(self.task, total=total, completed=done)
-            if self.still.is_set() and now - self.shown_at > _OFTEN:
+            if not self.animated and now - self.shown_at > _OFTEN:
                 self.shown_at = now
                 self.progress.refresh()
         elif now - self.shown_at > _SELDOM:
@@ -262,7 +250,9 @@ class FlightWatch(_Screen):
 
 
 class SweepWatch(_Screen):
-    """Progress display of a sweep."""
+    """Progress display of a sweep, drawn as it goes on: workers may be forks, which want no thread."""
+
+    animated = False
 
     def __init__(self) -> None:
         super().__init__()
@@ -274,8 +264,6 @@ class SweepWatch(_Screen):
         before = 0 if self.last is None else self.last.flown
         if progress.flown > before and (self.base is None or self.base.workers != progress.workers):
             self.base = progress  # measure the rate of these workers without their start-up
-        if progress.flown and progress.workers > 1:
-            self.stop_animation()  # the cores are for the workers, and these may be forks, which want no thread
         self.last = progress
         if self.base is not None:
             self.show_progress(progress.runs, progress.done, perf_counter())

@@ -15,7 +15,6 @@ from rigidfleet.cli.outputs import Files
 from rigidfleet.errors import RigidfleetError
 
 if TYPE_CHECKING:
-    from rigidfleet.mission import Mission
     from rigidfleet.result import Result
 from rigidfleet.cli.codes import FAILED, INTERRUPTED, PASSED
 
@@ -92,9 +91,13 @@ def run(
         loaded = loaded.rewritten(data | {"abort": data.get("abort", {}) | {"at": abort_at}})
     files = Files(out or Path("flights", loaded.name), loaded.name)
     files.check_writable(replace=force)
-    with show_progress(None if quiet else console.FlightWatch()) as progress:
-        result, interrupted = fly(loaded, progress)
+    from rigidfleet.simulation.flight import FlightInterrupted, simulate
 
+    with show_progress(None if quiet else console.FlightWatch()) as progress:
+        try:
+            result, interrupted = simulate(loaded, progress=progress), False
+        except FlightInterrupted as stop:
+            result, interrupted = stop.result, True
     verdict = files.save(result)
     if csv:
         try:
@@ -161,16 +164,6 @@ def missions(
         console.print_sheet(Sheet("", "", [FactTable(heads, rows, heads)]))
         console.out().print(first, soft_wrap=True)
     return PASSED
-
-
-def fly(mission: Mission, progress: Callable[..., None] | None) -> tuple[Result, bool]:
-    """Fly a mission; return its result and whether the flight was interrupted."""
-    from rigidfleet.simulation.flight import FlightInterrupted, simulate
-
-    try:
-        return simulate(mission, progress=progress), False
-    except FlightInterrupted as stop:
-        return stop.result, True
 
 
 @contextmanager

@@ -95,7 +95,7 @@ def figure_names(result: Result | None = None) -> list[str]:
     """
     if result is None:
         return list(_FIGURES)
-    return [name for name, draw in _FIGURES.items() if vars(draw).get("there", bool)(result)]
+    return [name for name, draw in _FIGURES.items() if vars(draw)["there"](result)]
 
 
 def caption(name: str) -> str:
@@ -198,8 +198,6 @@ def render_figure(
 ) -> dict[str, bytes]:
     """Contents of a figure's files by format; parameters are those of `plot`."""
     figure = _draw_figure(result, name, **look)
-    with apply_style():
-        figure.set_layout_engine(None)  # it is laid out; with "none", matplotlib draws it once more
     return encode_figure(figure, formats, close=not look.get("titles", True))
 
 

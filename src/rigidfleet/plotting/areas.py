@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 PEOPLE = "#6A3D9A"
 #: Line of a soft fence.
 _SOFT = 0, (4, 2)
-#: Colour of places where vehicles fall, and the most places of a kind that are drawn.
-_FALLS, _MOST = "#E69F00", 4000
+#: Colour of places where vehicles fall; the most places of a kind that are drawn, and areas that a legend names.
+_FALLS, _MOST, _NAMED = "#E69F00", 4000, 6
 
 
 def areas(mission: Mission) -> list[tuple[str, list[Floats], dict[str, Any]]]:
@@ -72,9 +72,11 @@ def falls_of(result: Result) -> Floats:
     return Boundaries(result.mission).ends(result.position, result.velocity)[..., :2]
 
 
-@st.in_style
+@st.figure_of()
 def sketch(result: Result, falls: Floats) -> Figure:
     """The ground from above: fences, people, and where vehicles fly and fall (`falls_of`)."""
+    from matplotlib.patches import Patch
+
     fig = st.blank_figure(5.2, 3.6, "constrained")
     ax = fig.subplots()
     draw_from_above(ax, result.mission)
@@ -86,14 +88,10 @@ def sketch(result: Result, falls: Floats) -> Figure:
         flat = places[result.left]
         ax.plot(*flat[:: 1 + len(flat) // _MOST].T, ".", markersize=2, color=colour, zorder=2)
         handles.append(st.legend_entry(what, linestyle="", marker="o", markersize=5, color=colour))
-    for soft in sorted({fence.soft for fence in result.mission.fences}):
-        look: dict[str, Any] = {"linestyle": _SOFT} if soft else {}
-        name = "soft fence" if soft else "fence"
-        handles.append(st.legend_entry(name, color=st.ALERT, linewidth=1.1, **look))
-    if result.mission.people:
-        handles.append(st.legend_entry("people", color=PEOPLE, linewidth=5.0, alpha=0.4))
+    for name, _, look in areas(result.mission)[:_NAMED]:
+        handles.append(Patch(label=st.clean_name(name), **look))
     ax.set(xlabel="x, east [m]", ylabel="y, north [m]")
     ax.margins(0.06)
     ax.set_aspect("equal", adjustable="box")
-    fig.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    fig.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4))
     return fig

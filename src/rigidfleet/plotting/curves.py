@@ -99,7 +99,7 @@ def draw_edge_lines(ax: Axes, result: Result, values: Floats, **look: Any) -> No
             st.draw_spread(ax, result.time, of_group, group.colour)
             continue
         for x in of_group.T:
-            st.draw_line(ax, result.time, x, color=group.colour, **look)
+            ax.plot(result.time, x, color=group.colour, **look)
 
 
 def edge_handles(result: Result) -> list[Line2D]:
@@ -138,8 +138,7 @@ def has_edges(result: Result) -> bool:
     return len(result.edges) > 0
 
 
-@st.in_style
-@st.needs(has_edges, "no edges")
+@st.figure_of(has_edges, "no edges")
 def distances(result: Result) -> Figure:
     """Distances of the active edges, with their references (dashed)."""
     fig, axes = st.time_figure(result, "Distances between agents", 1, height=3.4)
@@ -156,9 +155,7 @@ def distances(result: Result) -> Figure:
 #: Flown and commanded values (K, 3), those of waypoints (time, [3]), names of the components and their unit.
 _Column = tuple[Floats, Floats, list[tuple[float, Any]], str, str]
 #: A waypoint.
-_RING: dict[str, Any] = {
-    "linestyle": "", "marker": "o", "markersize": 5.5, "markerfacecolor": "white", "markeredgecolor": st.INK,
-}  # fmt: skip
+_RING = st.marker_look(st.INK, 5.5, hollow=True)
 
 
 def _draw_components(result: Result, axes: Any, column: _Column) -> None:
@@ -166,10 +163,10 @@ def _draw_components(result: Result, axes: Any, column: _Column) -> None:
     flown, wanted, targets, names, unit = column
     for i, (ax, name) in enumerate(zip(axes, names.split(), strict=True)):
         goals = np.array([goal[i] for _, goal in targets], dtype=float)
-        st.draw_line(ax, result.time, flown[:, i], color=st.FLOWN, linewidth=2.4)
+        ax.plot(result.time, flown[:, i], color=st.FLOWN, linewidth=2.4)
         st.draw_reference(ax, result.time, wanted[:, i])
         for t, goal in targets:
-            ax.plot(t, goal[i], **_RING, markeredgewidth=1.0, zorder=4, clip_on=False)
+            ax.plot(t, goal[i], **_RING, zorder=4, clip_on=False)
         ax.set_ylabel(f"{name} [{unit}]")
         fit_to_variation(ax, np.concatenate([flown[:, i], wanted[:, i], goals]), unit)
 
@@ -210,7 +207,7 @@ def _body_figure(result: Result, title: str, *columns: _Column) -> Figure:
     return fig
 
 
-@st.in_style
+@st.figure_of()
 def cm(result: Result) -> Figure:
     """Centre of mass: flown, reference (dashed) and waypoints (rings)."""
     places, speeds = _waypoint_values(result, "position"), _waypoint_values(result, "velocity")
@@ -249,8 +246,7 @@ def has_attitude(result: Result) -> bool:
     return bool(np.isfinite([result.attitude, result.attitude_reference]).any())
 
 
-@st.in_style
-@st.needs(has_attitude, "no body frame attached")
+@st.figure_of(has_attitude, "no body frame attached")
 def attitude(result: Result) -> Figure:
     """Attitude of the formation: flown, reference (dashed) and waypoints (rings)."""
     flown, wanted, targets = flown_and_wanted_euler(result)
@@ -278,8 +274,7 @@ def draw_thrust(ax: Axes, result: Result) -> None:
     panel.draw(distinct_limits(result.mission.fleet.thrust_limit), always=False)
 
 
-@st.in_style
-@st.needs(has_thrust, "forces are not known")
+@st.figure_of(has_thrust, "forces are not known")
 def inputs(result: Result) -> Figure:
     """Thrust of each vehicle with its limit, and enlarged."""
     fig, axes = st.time_figure(result, "Thrust of each agent", 2)
@@ -296,8 +291,7 @@ def inputs(result: Result) -> Figure:
     return fig
 
 
-@st.in_style
-@st.needs(has_edges, "no edges")
+@st.figure_of(has_edges, "no edges")
 def constraint_force(result: Result) -> Figure:
     """Constraint force on each vehicle, and tension of each edge (negative: the edge pushes)."""
     force, tension = np.linalg.norm(result.constraint_force, axis=2), -result.multiplier
@@ -320,8 +314,7 @@ def constraint_force(result: Result) -> Figure:
     return fig
 
 
-@st.in_style
-@st.needs(lambda result: result.disturbance_force is not None, "still air")
+@st.figure_of(lambda result: result.disturbance_force is not None, "still air")
 def disturbance(result: Result) -> Figure:
     """Aerodynamic force on each vehicle, and distance of each vehicle from its slot."""
     fig, axes = st.time_figure(result, "Aerodynamic force, and distance from the slots", 2)
@@ -369,12 +362,12 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     if np.isfinite(shape).any():
         look: dict[str, Any] = {"color": st.FLOWN, "linewidth": 2.0, "zorder": 1.9}
         known = np.isfinite(shape) if result.n_agents > st.MANY else slice(None)
-        st.draw_line(ax, result.time[known], shape[known], **look)
+        ax.plot(result.time[known], shape[known], **look)
         handles.append(st.legend_entry("greatest error of all pairs", **look))
     if np.isfinite(size).any():
         draw_edge_lines(ax, result, size, linewidth=0.6, alpha=0.7)
         look = {"color": st.INK, "linewidth": 1.3}
-        st.draw_line(ax, result.time, np.fmax.reduce(size, axis=1), **look)
+        ax.plot(result.time, np.fmax.reduce(size, axis=1), **look)
         handles.append(st.legend_entry("greatest |c| of an edge", **look))
     if not handles:
         st.write_note(ax, "neither edges nor slots")
@@ -385,17 +378,13 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     large = seen[seen > _SMALLEST]
     if len(large):
         ax.set_ylim(max(_SMALLEST, 0.5 * float(large.min())), 3 * float(large.max()))
-        if ax.get_ylim()[0] == _SMALLEST and len(large) < len(seen):
-            words = f"not drawn: below {_SMALLEST:g} m (rounding)"
-            st.annotate(ax, words, st.corner_places()[::-1], color=st.GREY)
     else:
         ax.set_ylim(_SMALLEST, 1.0)
         st.write_note(ax, f"only rounding errors: at most {seen.max():.1g} m")
     return handles
 
 
-@st.in_style
-@st.needs(lambda result: has_edges(result) or result.mission.formations)
+@st.figure_of(lambda result: has_edges(result) or result.mission.formations)
 def constraint_error(result: Result) -> Figure:
     """Constraint error |c| of each edge (length minus reference), and shape error of all pairs."""
     title = "Constraint error, and shape error of all pairs against the slots"
@@ -432,8 +421,8 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
             ax.set_ylim(0.0, 1.4 * limit)
             st.draw_limit(ax, limit, f"limit {limit:g} m")
         return
-    st.draw_line(ax, result.time, values, color=st.TONES[0])
-    st.draw_limit(ax, limit, f"limit {limit:g} m" if limit or name == "people" else "contact")
+    ax.plot(result.time, values, color=st.TONES[0])
+    st.draw_limit(ax, limit, f"limit {limit:g} m")
     if name == "separation":
         _draw_planned(ax, result)
         if (flying := QUANTITIES["separation_flying"].limit_of(result.mission)) is not None:
@@ -448,8 +437,7 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
     look: dict[str, Any] = {"markerfacecolor": "none", "markeredgecolor": st.INK}
     ax.plot(x.time, x.value, "o", markersize=5, clip_on=False, **look)
     who = st.clean_name(owner_name(result, q, x.who, x.other))
-    places = st.places_around(x.time, x.value)
-    st.annotate(ax, f"{x.value:.3g} m at {x.time:.2f} s, {who}", places)
+    st.write_above(ax, f"least {x.value:.3g} m at {x.time:.2f} s, {who}")
     low, high = min(float(np.nanmin(values)), limit), max(float(np.nanmax(values)), limit)
     room = 0.25 * max(high, -low, 0.1)
     ax.set_ylim(min(low, 0.0) - room, max(high, 0.0) + room)
@@ -462,9 +450,7 @@ def _draw_planned(ax: Axes, result: Result) -> None:
     for least, p in proved:
         ax.hlines(least, p.t_start, p.t_end, st.ALERT, linewidth=0.8, linestyle=":", gid="planned")
     if proved:
-        least, p = min(proved, key=lambda each: each[0])
-        words = f"as planned, less {allowed:g} m"
-        st.annotate(ax, words, st.places_around(p.t_start, least), color=st.ALERT)
+        st.write_above(ax, f"dotted: as planned, less {allowed:g} m")
 
 
 def _distances_shown(result: Result) -> list[str]:
@@ -479,8 +465,7 @@ def _distances_shown(result: Result) -> list[str]:
     return [name for name in there if there[name]]
 
 
-@st.in_style
-@st.needs(_distances_shown, "only one agent, and nothing near it")
+@st.figure_of(_distances_shown, "only one agent, and nothing near it")
 def clearance(result: Result) -> Figure:
     """Distances between surfaces, with the limits."""
     names = _distances_shown(result)
@@ -499,8 +484,7 @@ def limited_motions(result: Result) -> list[Quantity]:
     return [q for q in MOTIONS if q.limit_of(result.mission) is not None]
 
 
-@st.in_style
-@st.needs(limited_motions)
+@st.figure_of(limited_motions)
 def motion(result: Result) -> Figure:
     """Speed, acceleration and jerk of each vehicle, as far as they are limited, with their limits."""
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]

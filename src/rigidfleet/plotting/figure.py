@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from matplotlib import figure
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.text import Annotation
 
 #: Pixels per inch of a notebook's screen.
 _SHOWN = 100
@@ -21,14 +20,12 @@ class Figure(figure.Figure):
     Attributes
     ----------
     settings : a context in which it is drawn
-    words : texts that stand where they cover nothing, each with its possible places
     """
 
     settings: Callable[[], AbstractContextManager[Any]] = nullcontext
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self.words: list[tuple[Annotation, Sequence[Any]]] = []
         # This canvas keeps its renderer; without it, each measure of a text would make a new one.
         FigureCanvasAgg(self)
 

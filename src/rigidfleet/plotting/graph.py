@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from rigidfleet.mission import Mission
     from rigidfleet.rigidity import Rigidity
 
-_FORMATS = (".png", ".svg", ".pdf")
 #: Greatest number of edges with their lengths.
 _FEW = 12
 #: The longest arrow of a free motion, relative to the size of the shape.
@@ -47,10 +46,10 @@ def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: P
     """
     from rigidfleet._common.files import write_file
     from rigidfleet.errors import ResultError
-    from rigidfleet.plotting import encode_figure
+    from rigidfleet.plotting import FORMATS, encode_figure
 
-    if path.suffix not in _FORMATS:
-        known = ", ".join(_FORMATS)
+    if path.suffix[1:] not in FORMATS:
+        known = ", ".join(f".{kind}" for kind in FORMATS)
         raise ResultError(
             f"{path}: the name has no figure format. Give a name that ends in {known}."
         )

@@ -96,8 +96,7 @@ def log_names(result: Result) -> list[str]:
     return [st.clean_name(x) for x in result.statistics["names"]]
 
 
-@st.in_style
-@st.needs(lambda result: "bands" in result.statistics, "no log against a plan")
+@st.figure_of(lambda result: "bands" in result.statistics, "no log against a plan")
 def plan_and_flight(result: Result) -> Figure:
     """The plan (dashed) and the flight from above, and how far vehicles are from their slots, with what is in doubt."""
     fig = st.blank_figure(st.WIDTH, 3.9, "constrained")
@@ -116,7 +115,7 @@ def plan_and_flight(result: Result) -> Figure:
         above.plot(*result.position[:, i, :2].T, **look, linewidth=1.4)
         above.plot(*slots[:, i, :2].T, **st.REFERENCE, zorder=3)
         below.fill_between(time, low[:, i], high[:, i], **look, alpha=0.25, linewidth=0)
-        st.draw_line(below, time, 1e3 * off.far[:, i], **look)
+        below.plot(time, 1e3 * off.far[:, i], **look)
         mine = [drift for drift in off.drift_spans(time) if drift.who == i]
         for drift in mine:  # where and when it is off, in bold
             k = slice(*np.searchsorted(time, [drift.start, drift.end]))
@@ -125,16 +124,14 @@ def plan_and_flight(result: Result) -> Figure:
             below.plot(time[k], 1e3 * off.far[k, i], **bold)
         if mine:
             worst = max(mine, key=lambda drift: drift.worst)
-            words = f"{names[i]}: {value(1e3 * worst.worst, 'mm')} at {worst.at:.2f} s"
-            place = st.places_around(worst.at, 1e3 * worst.worst)
-            st.annotate(below, words, place, color=colours[i])
+            names[i] += f": {value(1e3 * worst.worst, 'mm')} at {worst.at:.2f} s"
     below.set_ylim(0.0, 1.25 * float(np.fmax.reduce(high, axis=None, initial=1e-3)))
     words = "unusual from" if result.mission.limits.tracking_error is None else "limit"
     st.draw_limit(below, 1e3 * off.limit, f"{words} {value(1e3 * off.limit, 'mm')}")
     above.set(xlabel="x, east [m]", ylabel="y, north [m]")
     above.set_aspect("equal", adjustable="datalim")
     below.set(xlabel="time [s]", ylabel="distance from the slot [mm]")
-    look = {"loc": "outside lower center", "ncols": min(n + 1, 8)}
+    look = {"loc": "outside lower center", "ncols": min(n + 1, 4)}
     entries = [st.legend_entry(names[i], color=colours[i]) for i in shown]
     fig.legend(handles=[*entries, st.legend_entry("plan", **st.REFERENCE)], **look)
     return fig

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 _DIVERGES = 1e4
 
 
-@st.in_style
-@st.needs(lambda result: np.size(result.message_age or ()), "no network: one law knows all states")
+@st.figure_of(
+    lambda result: np.size(result.message_age or ()), "no network: one law knows all states"
+)
 def messages(result: Result) -> Figure:
     """Age of the oldest message that each vehicle goes by, and the force by which the group pushes itself."""
     fig, axes = st.time_figure(result, "Messages of neighbours", 2)
@@ -34,7 +35,7 @@ def messages(result: Result) -> Figure:
     if net.silence < 2.0 * np.nanmax(age, initial=0.0):
         st.draw_limit(above, net.silence, f"an edge is let go: {net.silence:g} s")
     push = np.linalg.norm(np.nansum(result.constraint_force, axis=1), axis=1)
-    st.draw_line(below, result.time, push, color=st.FLOWN)
+    below.plot(result.time, push, color=st.FLOWN)
     if push.max() > _DIVERGES * np.median(push) > 0.0:
         below.set_yscale("log")
     else:

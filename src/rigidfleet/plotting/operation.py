@@ -22,8 +22,7 @@ def leaves_ground(result: Result) -> bool:
     return any(phase.vertical is not None for phase in result.mission.phases)
 
 
-@st.in_style
-@st.needs(leaves_ground)
+@st.figure_of(leaves_ground)
 def operation(result: Result, agents: Sequence[int] = ()) -> Figure:
     """Altitude and speeds of all vehicles, their least separation, and their clearance to obstacles.
 
@@ -71,6 +70,6 @@ def _draw_vehicle_lines(
         return st.agent_line_handles(result.n_agents)
     colours = st.agent_colours(len(agents))
     return [
-        st.draw_line(ax, result.time, values[:, i - 1], color=colour, label=f"agent {i}")
+        ax.plot(result.time, values[:, i - 1], color=colour, label=f"agent {i}")[0]
         for i, colour in zip(agents, colours, strict=True)
     ]

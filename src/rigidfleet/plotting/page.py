@@ -37,7 +37,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
     handles = []
     for i, (name, width) in enumerate((("roll", 1.2), ("pitch", 1.8), ("yaw", 2.4))):
         look: dict[str, Any] = {"color": st.TONES[i], "linewidth": width, "zorder": 2.3 - 0.1 * i}
-        st.draw_line(ax, result.time, flown[:, i], **look)
+        ax.plot(result.time, flown[:, i], **look)
         st.draw_reference(ax, result.time, wanted[:, i])
         handles.append(st.legend_entry(name, **look))
     _legend_above(ax, handles)
@@ -45,8 +45,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
 
 
 # Of trajectories that others made, most panels would be empty.
-@st.in_style
-@st.needs(lambda x: curves.has_edges(x) or curves.has_thrust(x) or curves.has_attitude(x))
+@st.figure_of(lambda x: curves.has_edges(x) or curves.has_thrust(x) or curves.has_attitude(x))
 def summary(result: Result) -> Figure:
     """Summary of the flight on one page.
 
@@ -63,6 +62,7 @@ def summary(result: Result) -> Figure:
     for ax in over_time:
         st.draw_time_axis(ax, result)
         ax.set_xlabel("time [s]")
+    key = textwrap.fill(st.number_phases(over_time, result), 150, max_lines=3, placeholder=" …")
     if curves.has_edges(result):
         curves.draw_distances(lengths, result)
     elif result.mission.obstacles and result.n_agents > 1:
@@ -74,7 +74,6 @@ def summary(result: Result) -> Figure:
     _draw_attitude(angles, result)
     curves.draw_thrust(thrust, result)
     curves.draw_least(apart, result, "clearance" if result.mission.obstacles else "separation")
-    key = textwrap.fill(st.number_phases(over_time, result), 150, max_lines=3, placeholder=" …")
     entries = space.legend_handles(result, view)
     fig.legend(
         handles=entries, loc="lower center", ncols=math.ceil(len(entries) / (1 if len(entries) <= 10 else 2)),

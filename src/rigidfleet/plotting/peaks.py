@@ -88,15 +88,14 @@ class Panel:
                 t = time[int((size > sign * edge).any(axis=1).argmax())]
                 look: dict[str, Any] = {"color": st.ALERT, "markersize": 5, "clip_on": False}
                 ax.plot(t, edge, marker, **look, zorder=6, gid="cut")
-                places = [*st.places_around(t, edge), *st.corner_places()]
-                st.annotate(ax, f"off scale: {caption}", places, color=st.ALERT)
+                st.write_above(ax, f"off scale: {caption}", st.ALERT)
                 continue
             if high <= peak < 1.5 * high:
                 ax.set_ylim(low, peak + 0.05 * (peak - low))
             if peak > values[k, i]:
                 ring: dict[str, Any] = {"markerfacecolor": "none", "markeredgecolor": st.INK}
                 ax.plot(when, peak, "o", markersize=4, **ring)
-            st.annotate(ax, caption, st.corner_places())
+            st.write_above(ax, caption)
 
     def note_if_rounding(self) -> bool:
         """If values are only rounding errors, say so in the axes; return whether they are."""

@@ -10,7 +10,7 @@ import numpy as np
 from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.logged import true_runs
-from rigidfleet.plotting.peaks import Panel, distinct_limits
+from rigidfleet.plotting.peaks import Panel
 from rigidfleet.result import LABELS, Extremum, Result
 from rigidfleet.result.quantities import samples
 from rigidfleet.typing import Bools, Floats
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from rigidfleet.mission import Mission
 
-_ROWS = 12  # greatest number of vehicles with a bar each; of more, their number is drawn
 _TEXT_ROW = 0.35  # height of a row that holds only text
 
 
@@ -57,10 +56,9 @@ def _nearest_to_limit(result: Result, limits: Floats) -> Extremum | None:
     return max(every, key=lambda x: x.value / limits[x.who], default=None)
 
 
-@st.in_style
-@st.needs(has_rotors, "no rotors")
+@st.figure_of(has_rotors, "no rotors")
 def rotors(result: Result) -> Figure:
-    """Greatest force of a rotor of each vehicle with its limit; all rotors of the one nearest to its limit."""
+    """Greatest force of a rotor of each vehicle as a share of its limit; all rotors of the one nearest to its limit."""
     fig, axes = st.time_figure(result, "Force of the rotors", 2)
     above, below = axes[:, 0]
     _draw_greatest(above, result)
@@ -70,18 +68,16 @@ def rotors(result: Result) -> Figure:
 
 
 def _draw_greatest(ax: Axes, result: Result) -> None:
-    """The greatest of the four rotors of each vehicle; as a share of the limit if limits differ."""
-    limits, force = rotor_limits(result.mission), rotor_forces(result).max(axis=2)
-    between, unit = _nearest_to_limit(result, limits), "N"
-    shown = distinct_limits(limits)
-    ax.set_ylabel("greatest rotor force [N]")
-    if len(shown) > 1:
-        if between is not None:
-            between = between._replace(value=100.0 * between.value / limits[between.who])
-        force, unit, shown = 100.0 * force / limits, "%", [(100.0, "limit", st.ALERT)]
-        ax.set_ylabel("share of the rotor limit [%]")
-    between = None if between is None else between._replace(other=-1)
-    Panel(ax, result, force, unit, between).draw(shown)
+    """The greatest of the four rotors of each vehicle, as a share of its limit."""
+    limits = rotor_limits(result.mission)
+    share, between = (
+        100.0 * rotor_forces(result).max(axis=2) / limits,
+        _nearest_to_limit(result, limits),
+    )
+    if between is not None:
+        between = between._replace(value=100.0 * between.value / limits[between.who], other=-1)
+    ax.set_ylabel("share of the rotor limit [%]")
+    Panel(ax, result, share, "%", between).draw([(100.0, "limit", st.ALERT)])
 
 
 def _draw_nearest(ax: Axes, result: Result) -> None:
@@ -94,7 +90,7 @@ def _draw_nearest(ax: Axes, result: Result) -> None:
         i = e.who
     colours = st.colour_scale(4)
     for k, colour in enumerate(colours):
-        st.draw_line(ax, result.time, force[:, i, k], color=colour, linewidth=1.9 - 0.35 * k)
+        ax.plot(result.time, force[:, i, k], color=colour, linewidth=1.9 - 0.35 * k)
     Panel(ax, result, force[:, i], "N").leave_out_final_peak()
     low, high = ax.get_ylim()
     if limits[i] < high + 0.3 * (high - low):
@@ -105,8 +101,7 @@ def _draw_nearest(ax: Axes, result: Result) -> None:
     st.draw_legend(ax, entries, "nearest to its limit")
 
 
-@st.in_style
-@st.needs(has_rotors, "no rotors")
+@st.figure_of(has_rotors, "no rotors")
 def vehicles(result: Result) -> Figure:
     """Tilt of each vehicle, its distance from its slot, and when it is asked for more than its rotors give."""
     saturated = np.zeros(result.left.shape, dtype=np.bool_)
@@ -145,22 +140,19 @@ def draw_with_limit(ax: Axes, result: Result, name: str, values: Floats | None =
 
 
 def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
-    """A bar for each vehicle while it is saturated; of many vehicles, how many are."""
+    """A bar for each vehicle while it is saturated."""
+    from matplotlib.ticker import MaxNLocator
+
     n, t = result.n_agents, result.time
     if not saturated.any():
         st.write_note(ax, "no vehicle is asked for more than its rotors give")
-        return
-    if n > _ROWS:
-        ax.fill_between(t, saturated.sum(axis=1), step="post", color=st.FLOWN, linewidth=0)
-        ax.set_ylim(0, 1.12 * max(1, int(saturated.sum(axis=1).max())))
-        ax.set_ylabel("saturated\n[vehicles]")
         return
     for i, colour in enumerate(st.agent_colours(n)):
         last = np.append(t, t[-1])
         bars = [(t[a], last[b] - t[a]) for a, b in true_runs(saturated[:, i])]
         ax.broken_barh(bars, (i + 0.6, 0.8), color=colour, linewidth=0.4)
     ax.set_ylim(n + 0.6, 0.4)
-    ax.set_yticks(range(1, n + 1))
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_ylabel("saturated\nagent")
     limit = QUANTITIES["saturation"].limit_of(result.mission)
-    st.annotate(ax, f"limit {limit:.3g} % of a phase", st.corner_places(), color=st.ALERT)
+    st.write_above(ax, f"limit {limit:.3g} % of a phase")

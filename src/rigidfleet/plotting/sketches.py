@@ -11,7 +11,7 @@ import numpy as np
 from rigidfleet.formation import distance_geometry
 from rigidfleet.plotting import curves
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.space import camera, marker_look
+from rigidfleet.plotting.space import camera
 from rigidfleet.result import Result
 from rigidfleet.result.lights import plane_view
 from rigidfleet.typing import Floats
@@ -59,8 +59,7 @@ def tiled_figure(n: int, above: float, below: float) -> tuple[Figure, list[Axes]
     return fig, axes.ravel().tolist()[:n]
 
 
-@st.in_style
-@st.needs(lambda result: result.mission.formations, "the mission has no formation")
+@st.figure_of(lambda result: result.mission.formations, "the mission has no formation")
 def formations(result: Result) -> Figure:
     """Formations with their edges and body axes."""
     names = list(result.mission.formations)
@@ -182,7 +181,7 @@ def draw_graph(
     for i in np.argsort(p[:, 2]):
         colour = shown[i]
         x, y = p[i, :2]
-        ax.plot(x, y, **marker_look(colour, size), zorder=5, gid=f"agent-{i + 1}")
+        ax.plot(x, y, **st.marker_look(colour, size), zorder=5, gid=f"agent-{i + 1}")
         if size > 7:
             light = float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114)))
             ax.text(

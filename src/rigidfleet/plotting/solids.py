@@ -14,6 +14,7 @@ from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.path import Path
     from mpl_toolkits.mplot3d import Axes3D
 
     from rigidfleet.mission import Mission
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 COLOUR = "#9A9184"
 #: Number of places at which a moving obstacle is drawn, and the opacity of the first, as a share of the last.
 _PLACES, _FIRST = 5, 0.3
+#: Where the light comes from: clockwise from the north, and above the ground [deg].
+_FROM, _ABOVE = 215.0, 50.0
 #: Number of points of the way of a moving obstacle.
 _WAY = 200
 
@@ -86,6 +89,7 @@ def _opacities(shape: DrawnObstacle) -> Floats:
 
 def draw_in_space(ax: Axes3D, shape: DrawnObstacle) -> None:
     """Draw an obstacle in three dimensions: lit faces, the lines of its shape, and its way."""
+    from matplotlib.colors import LightSource, to_rgb, to_rgba
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
     colour = st.ALERT if shape.zone else COLOUR
@@ -94,11 +98,16 @@ def draw_in_space(ax: Axes3D, shape: DrawnObstacle) -> None:
     if shape.plain:  # its sides, as seams between translucent triangles would show
         faces = np.concatenate([faces[:6], faces[6:, 2:]], axis=1)
     for at, share in zip(shape.at, _opacities(shape), strict=True):
-        opacity = 0.07 if shape.zone else 0.22 if shape.plain else 0.7 if shape.terrain else 0.6
+        opacity = 0.07 if shape.zone else 0.2 if shape.plain else 0.25
         opacity *= float(share)
-        colours, zorder = _face_colours(shape, faces, colour, opacity), 0.5 if shape.terrain else 2
-        look: dict[str, Any] = {"edgecolors": "none", "linewidths": 0, "antialiaseds": shape.zone}
-        sides = Poly3DCollection(list(faces + at), facecolors=colours, **look, zorder=zorder)
+        paint = to_rgba(colour, opacity)
+        if not (shape.zone or shape.plain):
+            # Opaque in a paler colour: seams between translucent faces would show.
+            paint = tuple(1.0 - opacity * (1.0 - np.array(to_rgb(colour))))
+        look: dict[str, Any] = {"linewidths": 0, "antialiaseds": shape.zone}
+        look |= {"shade": True, "lightsource": LightSource(_FROM, _ABOVE)}
+        zorder = 0.5 if shape.terrain else 2
+        sides = Poly3DCollection(faces + at, facecolors=[paint], **look, zorder=zorder)
         sides.set_gid("obstacle")
         ax.add_collection3d(sides)
         ax.add_collection3d(
@@ -112,31 +121,28 @@ def draw_in_space(ax: Axes3D, shape: DrawnObstacle) -> None:
         ax.plot(*way.T, color=colour, linewidth=1.0, linestyle=(0, (1, 1.5)), zorder=2.2)
 
 
-def _face_colours(shape: DrawnObstacle, faces: Floats, colour: str, opacity: float) -> Floats:
-    """Colours (T, 4) of the faces (T, 3 or more, 3) of a shape, lighter towards the light."""
-    from matplotlib.colors import to_rgb
+def seen_from_above(triangles: Floats) -> Path:
+    """The area that triangles (T, 3, 3) [m] cover as they are seen from above."""
+    from matplotlib.path import Path
 
-    a, b, c = faces[:, :3].swapaxes(0, 1)
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    light = 0.5 + 0.5 * normal @ np.array([-0.36, -0.48, 0.8])
-    dark = (1.0 - np.array(to_rgb(colour))) * (1.25 - 0.75 * light[:, None])
-    if shape.zone or shape.plain:
-        return np.column_stack([np.clip(1.0 - dark, 0.0, 1.0), np.full(len(dark), opacity)])
-    # Opaque in a paler colour: seams between translucent faces would show.
-    return np.column_stack([np.clip(1.0 - opacity * dark, 0.0, 1.0), np.ones(len(dark))])
+    a, b, c = (flat := triangles[..., :2]).swapaxes(0, 1)
+    below = np.linalg.det(np.stack([b - a, c - a], axis=1)) < 0.0
+    flat = np.where(
+        below[:, None, None], flat[:, ::-1], flat
+    )  # all turn left, so that none cuts another out
+    return Path.make_compound_path(*(Path([*x, x[0]], closed=True) for x in flat))
 
 
 def draw_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     """Draw an obstacle from above: its outline at each place, its way, contours of a height map, and its name."""
+    from matplotlib.collections import LineCollection
     from matplotlib.colors import LinearSegmentedColormap
-    from matplotlib.patches import Polygon
+    from matplotlib.patches import PathPatch
 
     colour = st.ALERT if shape.zone else COLOUR
-    rim = convex_rim(shape.surface.triangles.reshape(-1, 3)[:, :2])
+    points = shape.surface.triangles.reshape(-1, 3)[:, :2]
     look: dict[str, Any] = {"facecolor": colour, "linewidth": 0, "zorder": 1}
-    dashed: dict[str, Any] = {"fill": False, "edgecolor": colour, "linestyle": (0, (4, 2))}
-    dashed |= {"linewidth": 0.8, "zorder": 1.1}
+    dashed: dict[str, Any] = {"colors": colour, "linestyles": [(0, (4, 2))], "linewidths": 0.8}
     if shape.grid is not None:
         x, y, z = shape.grid
         low_to_high = LinearSegmentedColormap.from_list("terrain", ["#F4F1EA", COLOUR])
@@ -144,32 +150,13 @@ def draw_from_above(ax: Axes, shape: DrawnObstacle) -> None:
         ax.contour(x, y, z.T, 8, colors=colour, linewidths=0.4, alpha=0.8, zorder=0.9)
     for at, share in zip(shape.at, _opacities(shape), strict=True):
         opacity = 0.0 if shape.terrain else 0.3 if not shape.zone else 0.1
-        patch = ax.add_patch(Polygon(rim + at[:2], **look, alpha=opacity * float(share)))
+        path = seen_from_above(shape.surface.triangles + at)
+        patch = ax.add_patch(PathPatch(path, **look, alpha=opacity * float(share)))
         if shape.zone:
-            ax.add_patch(Polygon(rim + at[:2], **dashed, alpha=float(share)))
+            lines = list((shape.surface.lines + at)[..., :2])
+            ax.add_collection(LineCollection(lines, **dashed, alpha=float(share), zorder=1.1))
     if len(shape.way) > 1:
-        way = shape.way[:, :2] + rim.mean(axis=0)
+        way = shape.way[:, :2] + points.mean(axis=0)
         ax.plot(*way.T, color=colour, linewidth=1.0, linestyle=(0, (1, 1.5)), zorder=1.2)
-    x, y = rim.mean(axis=0)[0], rim[:, 1].min()
+    x, y = (points[:, 0].min() + points[:, 0].max()) / 2, points[:, 1].min()
     st.name_box(ax, patch, x + shape.at[-1, 0], y + shape.at[-1, 1], shape.name)
-
-
-def convex_rim(points: Floats) -> Floats:
-    """Corners (C, 2) of the convex hull of points (P, 2) [m], anticlockwise, by Andrew's chains.
-
-    To load SciPy's takes a third of the time of the figures of `run`.
-    """
-    # Numbers x + iy, in order of x and y; upper and lower corners are the same but for rounding.
-    places = np.unique((points @ [1.0, 1.0j]).round(9)).tolist()
-    rim: list[complex] = []
-    for chain in places, places[::-1]:
-        part: list[complex] = []
-        for z in chain:
-            # No corner where the way turns right, or not at all
-            while (
-                len(part) > 1 and ((part[-1] - part[-2]).conjugate() * (z - part[-1])).imag < 1e-9
-            ):
-                part.pop()
-            part.append(z)
-        rim += part[:-1]  # its last corner begins the other chain
-    return np.array(rim).view(np.float64).reshape(-1, 2)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 _GROUND = "#E9E6DF"
-_ELEVATION = 24.0  # of the camera [deg]
+_AZIMUTH, _ELEVATION = -55.0, 24.0  # of the camera [deg]
 #: Least and greatest elevation of the camera in front of lights, and how far it stands aside, to show the axes [deg].
 _LOW, _HIGH, _ASIDE = 12.0, 60.0, 15.0
 _TRAIL = 1500  # points of an agent's path
@@ -163,9 +163,9 @@ def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
         _draw_many(ax, shots, colours)
     else:
         for colour, r in zip(colours, shots.transpose(1, 2, 0), strict=True):
-            ax.plot(*r, **marker_look(colour, 3), zorder=5)
-            ax.plot(*r[:, :1], **marker_look(colour, 5, hollow=True), zorder=6, gid="start")
-            ax.plot(*r[:, -1:], **marker_look(colour, 5, marker="s"), zorder=6, gid="end")
+            ax.plot(*r, **st.marker_look(colour, 3), zorder=5)
+            ax.plot(*r[:, :1], **st.marker_look(colour, 5, hollow=True), zorder=6, gid="start")
+            ax.plot(*r[:, -1:], **st.marker_look(colour, 5, marker="s"), zorder=6, gid="end")
 
 
 def _draw_many(ax: Axes, shots: Floats, colours: list[str]) -> None:
@@ -178,33 +178,18 @@ def _draw_many(ax: Axes, shots: Floats, colours: list[str]) -> None:
         ax.scatter(*r.T, s=4 if k in (0, last) else 3, **look, zorder=6 if hollow else 5)
 
 
-def marker_look(
-    colour: str, size: float, *, hollow: bool = False, marker: str = "o"
-) -> dict[str, Any]:
-    """Look of a marker of a size [points], filled or hollow."""
-    return {
-        "linestyle": "", "marker": marker, "markersize": size,
-        "markerfacecolor": "white" if hollow else colour,
-        "markeredgecolor": colour, "markeredgewidth": 1.2 if hollow else 0.0,
-    }  # fmt: skip
-
-
 def _cross(result: Result) -> dict[str, Any]:
     """Look of a waypoint, which is seen at night, too."""
     colour = st.GREY if has_lights(result) else st.INK
-    return {
-        "linestyle": "",
-        "marker": "+",
-        "markersize": 7,
-        "color": colour,
-        "markeredgewidth": 1.3,
-    }
+    return st.marker_look(colour, 7, marker="+") | {"markeredgewidth": 1.3}
 
 
 def _name_look(result: Result) -> dict[str, Any]:
-    """Look of the name of a waypoint."""
+    """Look of the name of a waypoint, with an outline in the colour of the background."""
+    from matplotlib.patheffects import withStroke
+
     ink, behind = (st.FAINT, st.NIGHT) if has_lights(result) else (st.INK, "white")
-    look = {"color": ink, "path_effects": st.halo(behind)}
+    look = {"color": ink, "path_effects": [withStroke(linewidth=2.5, foreground=behind)]}
     return look | {"fontsize": 7.5, "zorder": 8, "parse_math": False}
 
 
@@ -222,8 +207,9 @@ def draw_space(
     ax.set_proj_type("ortho")
     low, high = view.low, view.high
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     _set_ticks(ax)
-    azimuth, elevation = _azimuth(view), _ELEVATION
+    azimuth, elevation = _AZIMUTH, _ELEVATION
     if night := has_lights(result):
         ax.grid(visible=False)
         walls: tuple[Any, ...] = (ax.xaxis, ax.yaxis, ax.zaxis)
@@ -248,7 +234,6 @@ def draw_space(
         ax.text(*place, f"  {names}", va="bottom", **_name_look(result))
     ax.view_init(elevation, azimuth)
     _fit_axes(fig, ax, view, rect)
-    _name_axes(fig, ax, view)
     return ax
 
 
@@ -259,25 +244,9 @@ def _set_ticks(ax: Axes3D) -> None:
     for axis, span in zip((ax.xaxis, ax.yaxis, ax.zaxis), spans, strict=True):
         axis.set_major_locator(MaxNLocator(max(2, round(6 * span / max(spans)))))
         axis.set_tick_params(labelsize=7, pad=-1, color=st.FAINT)
+        axis.labelpad = -3.0
     ax.set_box_aspect([float(s) for s in spans])
     ax.patch.set_visible(False)
-
-
-def _azimuth(view: Scene) -> float:
-    """Azimuth [deg] at which the path is spread out most; x still points right and y away from the viewer."""
-    points = np.concatenate([view.paths.reshape(-1, 3), view.centre])
-    points = points[np.isfinite(points).all(axis=1)]
-
-    def spread(azimuth: float) -> float:
-        seen = points @ camera(azimuth, _ELEVATION)[:2].T
-        return float(np.linalg.det(np.cov(seen, rowvar=False)))
-
-    # Of nearly equivalent views, take the one nearest to the middle
-    candidates = sorted(range(-75, -14, 5), key=lambda a: abs(a + 55))
-    if len(points) < 3:
-        return candidates[0]
-    spreads = [spread(a) for a in candidates]
-    return next(a for a, x in zip(candidates, spreads, strict=True) if x >= 0.85 * max(spreads))
 
 
 def _on_screen(ax: Axes3D, points: Floats) -> Floats:
@@ -288,54 +257,18 @@ def _on_screen(ax: Axes3D, points: Floats) -> Floats:
     return ax.transData.transform(np.column_stack([x, y]))
 
 
-def _name_axes(fig: Figure, ax: Axes3D, view: Scene) -> None:
-    """Name the axes at a fixed distance from them; the distance of matplotlib's own names changes with the zoom."""
-    (x0, y0, z0), (x1, y1, z1) = view.low, view.high
-    # Corners of the floor from the left one, as seen; matplotlib draws the ticks of z right or left of these edges.
-    turns = round((ax.azim + 45) / 90)
-    ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
-    a, b, c = (ring[(turns + k) % 4] for k in range(3))
-    across, deep = ("y [m]", "x [m]") if turns % 2 else ("x [m]", "y [m]")
-    high = a if turns % 2 else c
-    edges = {
-        across: [(*a, z0), (*b, z0)],
-        deep: [(*b, z0), (*c, z0)],
-        "z [m]": [(*high, z1), (*high, z0)] if turns % 2 else [(*high, z0), (*high, z1)],
-    }
-    for name, edge in edges.items():
-        a, b = _on_screen(ax, np.array(edge))
-        along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
-        outward = np.array([along[1], -along[0]])
-        x, y = fig.transFigure.inverted().transform((a + b) / 2 + 0.33 * fig.dpi * outward)
-        angle = math.degrees(math.atan2(along[1], along[0]))
-        fig.text(x, y, name, ha="center", va="center", rotation=angle, fontsize=8)
-
-
 def _fit_axes(
     fig: Figure, ax: Axes3D, view: Scene, rect: tuple[float, float, float, float]
 ) -> None:
-    """Zoom and shift so that the box of the axes with its labels fills `rect` (left, bottom, width, height)."""
-    from matplotlib.transforms import Bbox
-
+    """Zoom so that the box of the axes with its labels fills `rect` (left, bottom, width, height)."""
     size = fig.get_size_inches() * fig.dpi
     left, bottom, width, height = np.array(rect) * np.tile(size, 2)
-    margin = 0.42 * fig.dpi  # for tick and axis labels
-    side = max(width, height)
-    spans = [float(s) for s in view.high - view.low]
-    ends = corners(view.low, view.high)
-
-    def place(x: float, y: float) -> None:
-        ax.set_position(Bbox.from_bounds(x, y, side, side).transformed(fig.transFigure.inverted()))
-        ax.apply_aspect()
-
-    place(left, bottom)
-    extent = np.ptp(_on_screen(ax, ends), axis=0)
+    side, margin = max(width, height), 0.55 * fig.dpi  # for tick and axis labels
+    corner = left + (width - side) / 2, bottom + (height - side) / 2
+    ax.set_position((*(corner / size), *(side / size)))
+    extent = np.ptp(_on_screen(ax, corners(view.low, view.high)), axis=0)
     zoom = min((width - 2 * margin) / extent[0], (height - 2 * margin) / extent[1])
-    ax.set_box_aspect(spans, zoom=zoom)
-    place(left, bottom)
-    now = _on_screen(ax, ends)
-    middle = (now.min(axis=0) + now.max(axis=0)) / 2
-    place(left + (left + width / 2 - middle[0]), bottom + (bottom + height / 2 - middle[1]))
+    ax.set_box_aspect([float(s) for s in view.high - view.low], zoom=zoom)
 
 
 # -- from above --------------------------------------------------------------------------------------
@@ -378,13 +311,13 @@ def legend_handles(result: Result, view: Scene) -> list[Any]:
     if has_lights(result):
         return waypoints
     ends = [
-        st.legend_entry("start", **marker_look(st.GREY, 5, hollow=True)),
-        st.legend_entry("end", **marker_look(st.GREY, 5, marker="s")),
+        st.legend_entry("start", **st.marker_look(st.GREY, 5, hollow=True)),
+        st.legend_entry("end", **st.marker_look(st.GREY, 5, marker="s")),
     ]
     return [*st.agent_handles(result.n_agents, marker="o", markersize=4), *ends, *waypoints]
 
 
-@st.in_style
+@st.figure_of()
 def trajectory(result: Result) -> Figure:
     """Paths of the vehicles, and the formation at selected times."""
     wide = st.figure_width(10.5)

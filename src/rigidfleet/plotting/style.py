@@ -9,7 +9,6 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import wraps
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
-    from matplotlib.text import Annotation, Text
-    from matplotlib.transforms import Bbox
+    from matplotlib.text import Text
 
 Draw = Callable[..., "Figure"]
 
@@ -49,10 +47,8 @@ WIDTH = 9.0  # width of a figure over time [in]
 _COLUMN = 5.5  # a figure that is narrower has one column of axes [in]
 _PAD = 0.07  # margin around the content [in]
 _DPI = 160  # resolution [pixels per inch]: also of measures, so that a text is measured once
-_DOT = _DPI / 100  # a hundredth of an inch [pixels]
-_OUTSIDE = 100  # cost of a text that leaves its axes
+_LETTERS = 19  # of words above an axes in an inch of its width
 _LONGEST = 28  # greatest length of a phase name
-_POINTS = 3000  # greatest number of samples of a line; more would be drawn over each other
 #: Number of agents or edges beyond which the spread is drawn instead of each line.
 MANY = 200
 _ENTRIES = 12  # greatest number of entries of a legend
@@ -61,10 +57,6 @@ _ENTRIES = 12  # greatest number of entries of a legend
 STILL = 1e-3
 _ROUNDING = 1e-9  # smaller deviations are not mentioned
 
-#: A possible place of a text: a point and its coordinate system, an offset [points] from it, alignment.
-Place = tuple[tuple[float, float], Any, tuple[float, float], str, str]
-#: Positions along the width of an axes, ends and middle first.
-_ALONG = ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
 #: Whether figures have titles, and their width [mm]; None for the usual one.
 _shape: ContextVar[tuple[bool, float | None]] = ContextVar("shape", default=(True, None))
 
@@ -91,34 +83,24 @@ def apply_style() -> Generator[None]:
         yield
 
 
-def in_style(draw: Draw) -> Draw:
-    """Draw a figure in our style."""
-
-    @wraps(draw)
-    def draw_in_style(*what: Any, **more: Any) -> Figure:
-        with apply_style():
-            figure = draw(*what, **more)
-            place_annotations(figure)
-            return figure
-
-    return draw_in_style
-
-
-def needs(there: Callable[[Result], object], nothing: str = "") -> Callable[[Draw], Draw]:
-    """Mark a figure of what a flight may lack: its picture then says that there is ``nothing``, if that is given."""
+def figure_of(
+    there: Callable[[Result], object] = bool, nothing: str = ""
+) -> Callable[[Draw], Draw]:
+    """Draw a figure in our style; where what it shows is not there, say that there is ``nothing``, if that is given."""
 
     def mark(draw: Draw) -> Draw:
         @wraps(draw)
-        def draw_if_there(result: Result, *more: Any) -> Figure:
-            if there(result) or not nothing:
-                return draw(result, *more)
-            name = getattr(draw, "__name__", "").replace("_", " ")
-            fig, axes = time_figure(result, name.capitalize(), 1)
-            write_note(axes[0, 0], nothing)
-            return fig
+        def draw_in_style(result: Result, *more: Any, **named: Any) -> Figure:
+            with apply_style():
+                if there(result) or not nothing:
+                    return draw(result, *more, **named)
+                name = getattr(draw, "__name__", "").replace("_", " ")
+                fig, axes = time_figure(result, name.capitalize(), 1)
+                write_note(axes[0, 0], nothing)
+                return fig
 
-        vars(draw_if_there)["there"] = there
-        return draw_if_there
+        vars(draw_in_style)["there"] = there
+        return draw_in_style
 
     return mark
 
@@ -253,129 +235,41 @@ def legend_entry(label: str, **look: Any) -> Line2D:
     return Line2D([], [], label=label, **look)
 
 
-def draw_line(ax: Axes, t: Floats, y: Floats, **look: Any) -> Line2D:
-    """Line through samples y (K,) at t (K,), thinned if there are more than can be seen."""
-    return ax.plot(*thin_out(t, y), **look)[0]
+def marker_look(
+    colour: str, size: float, *, hollow: bool = False, marker: str = "o"
+) -> dict[str, Any]:
+    """Look of a marker of a size [points], filled or hollow."""
+    return {
+        "linestyle": "", "marker": marker, "markersize": size,
+        "markerfacecolor": "white" if hollow else colour,
+        "markeredgecolor": colour, "markeredgewidth": 1.2 if hollow else 0.0,
+    }  # fmt: skip
 
 
-def thin_out(t: Floats, y: Floats, most: int = _POINTS) -> tuple[Floats, Floats]:
-    """About `most` samples or fewer that look the same: the first, least and greatest of each interval."""
-    if len(t) <= most:
-        return t, y
-    keep = {0, len(t) - 1}
-    for start, stop in pairwise(np.linspace(0, len(t), most // 3 + 1).astype(int).tolist()):
-        part = y[start:stop]
-        low, high = np.where(np.isnan(part), np.inf, part), np.where(np.isnan(part), -np.inf, part)
-        keep |= {start, start + int(low.argmin()), start + int(high.argmax())}
-    kept = sorted(keep)
-    return t[kept], y[kept]
-
-
-def draw_reference(ax: Axes, t: Floats, y: Floats) -> Line2D:
+def draw_reference(ax: Axes, t: Floats, y: Floats) -> None:
     """Draw a reference as a dashed line."""
-    return draw_line(ax, t, y, **REFERENCE, zorder=3)
+    ax.plot(t, y, **REFERENCE, zorder=3)
 
 
 def draw_limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
     """Draw a limit as a line with its name."""
     ax.axhline(value, color=colour, linewidth=1.0, linestyle=(0, (6, 2)), zorder=2.5, gid="limit")
-    along: list[Place] = [
-        ((x, value), ("axes fraction", "data"), (0, away), ha, va)
-        for x, ha in _ALONG
-        for va, away in (("bottom", 2), ("top", -2))
-    ]
-    annotate(ax, label, [*along, *corner_places()], color=colour)
+    write_above(ax, label)
 
 
-# -- text that covers nothing --------------------------------------------------------------------------
+# -- words about what is drawn ------------------------------------------------------------------------
 
 
-def annotate(ax: Axes, text: str, places: Sequence[Place], **look: Any) -> None:
-    """Write text in an axes, at the first of ``places`` where it covers neither lines nor other text."""
-    (x, y), units, offset, ha, va = places[0]
-    label = ax.annotate(
-        text, (x, y), offset, xycoords=units, textcoords="offset points", ha=ha, va=va, fontsize=7.5,
-        path_effects=halo(), parse_math=False, annotation_clip=False, zorder=6, gid="words", **look,
+def write_above(ax: Axes, words: str, colour: str = INK) -> None:
+    """Write words above an axes, where they cover nothing, behind those that stand there."""
+    before = ax.get_title(loc="right").replace("\n", " ")
+    whole = f"{before}  ·  {words}" if before else words
+    letters = int(_LETTERS * ax.bbox.width / _DPI)
+    over_phases = any(text.get_gid() == "phase" for text in ax.texts)
+    ax.set_title(
+        textwrap.fill(whole, letters), loc="right", pad=13.0 if over_phases else 3.0, fontsize=7.5, color=colour,
+        fontweight="normal", parse_math=False, gid="words",
     )  # fmt: skip
-    label.set_in_layout(False)
-    figure: Any = ax.figure
-    figure.words.append((label, places))
-
-
-def corner_places() -> list[Place]:
-    """Places along the top of an axes, then along its bottom."""
-    return [
-        ((x, y), "axes fraction", (0, -3 if va == "top" else 3), ha, va)
-        for y, va in ((1.0, "top"), (0.0, "bottom"))
-        for x, ha in _ALONG
-    ]
-
-
-def places_around(x: float, y: float) -> list[Place]:
-    """Places around a data point, near ones first, those below first."""
-    sides = (("center", 0.0), ("left", 1.0), ("right", -1.0))
-    near: list[Place] = [
-        ((x, y), "data", (6 * side, sign * away), ha, "top" if sign < 0 else "bottom")
-        for away in (6, 13, 22)
-        for sign in (-1, 1)
-        for ha, side in sides
-    ]
-    beside: list[Place] = [((x, y), "data", (8 * s, 0), ha, "center") for ha, s in sides[1:]]
-    return near[:6] + beside + near[6:]
-
-
-def place_annotations(fig: Any) -> None:
-    """Lay the figure out, and move annotated text to where it covers nothing, or least."""
-    engine = fig.get_layout_engine()
-    if engine is not None:
-        engine.execute(fig)
-    waiting = [text for text, _ in fig.words]
-    for label, places in fig.words:
-        waiting.remove(label)
-        ax = label.axes
-        # Phase names stand outside; text without a place yet covers nothing.
-        others = [
-            text.get_window_extent() for text in ax.texts
-            if text is not label and text not in waiting and text.get_gid() != "phase"
-        ]  # fmt: skip
-        best, chosen = math.inf, places[0]
-        for place in places:
-            _move(label, place)
-            covered = _overlap_cost(ax, label.get_window_extent().padded(2 * _DOT), others)
-            if covered < best:
-                best, chosen = covered, place
-            if not covered:
-                break
-        _move(label, chosen)
-        if best >= _OUTSIDE:  # beside its place rather than off the page
-            box, page = label.get_window_extent(), ax.bbox
-            over = min(0.0, page.x1 - box.x1) or max(0.0, page.x0 - box.x0)
-            label.set_position((chosen[2][0] + 72.0 * over / fig.dpi, chosen[2][1]))
-
-
-def _move(label: Annotation, place: Place) -> None:
-    label.xy, label.xycoords, offset, ha, va = place
-    label.set_position(offset)
-    label.set(ha=ha, va=va)
-
-
-def _overlap_cost(ax: Axes, box: Bbox, others: Sequence[Bbox]) -> int:
-    """Cost of a box [pixels] for what it covers: lines, bands, other boxes; highest for parts outside the axes."""
-    n = sum(box.overlaps(other) for other in others)
-    for line in ax.lines:
-        path = line.get_transform().transform_path(line.get_path())
-        if line.get_linestyle() in ("None", ""):
-            n += int(box.padded(3 * _DOT).count_contains(path.vertices) > 0)
-        else:
-            n += bool(path.intersects_bbox(box, filled=False))
-    for band in ax.collections:
-        paths = map(band.get_transform().transform_path, band.get_paths())
-        n += sum(bool(path.intersects_bbox(box, filled=True)) for path in paths)
-    inside = ax.bbox.padded(_DOT)
-    if not (inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1)):
-        over = (inside.x0 - box.x0, box.x1 - inside.x1, inside.y0 - box.y0, box.y1 - inside.y1)
-        n += _OUTSIDE + int(max(over))
-    return n
 
 
 def note_if_still(ax: Axes, values: Floats, unit: str) -> bool:
@@ -388,8 +282,7 @@ def note_if_still(ax: Axes, values: Floats, unit: str) -> bool:
     caption = f"{value:.6g} {unit} throughout" + (f", within {off:.1g}" if off > _ROUNDING else "")
     ax.set_ylim(value - 1.0, value + 1.0)
     ax.set_yticks([value], [f"{value:.6g}"])
-    place: Place = (0.5, value), ("axes fraction", "data"), (0, 5), "center", "bottom"
-    annotate(ax, caption, [place], color=GREY)
+    ax.text(0.5, 0.55, caption, transform=ax.transAxes, ha="center", fontsize=7.5, color=GREY)
     return True
 
 
@@ -397,13 +290,6 @@ def is_still(values: Floats) -> bool:
     """Whether all known values are the same, or none is known."""
     known = values[np.isfinite(values)]
     return not len(known) or float(np.ptp(known)) <= STILL
-
-
-def halo(colour: str = "white") -> list[Any]:
-    """An outline, in the colour of the background, of text that stands on lines."""
-    from matplotlib.patheffects import withStroke
-
-    return [withStroke(linewidth=2.5, foreground=colour)]
 
 
 def write_note(ax: Axes, words: str) -> None:
@@ -433,7 +319,7 @@ def draw_spread(ax: Axes, t: Floats, values: Floats, colour: str) -> None:
     look: dict[str, Any] = {"color": colour, "linewidth": 0.0, "zorder": 2.0}
     ax.fill_between(t, least, greatest, alpha=0.25, **look, gid="spread")
     ax.fill_between(t, low, high, alpha=0.45, **look)
-    draw_line(ax, t, middle, color=colour, linewidth=1.4, zorder=2.1)
+    ax.plot(t, middle, color=colour, linewidth=1.4, zorder=2.1)
 
 
 def draw_agent_lines(ax: Axes, result: Result, values: Floats) -> None:
@@ -448,7 +334,7 @@ def draw_agent_lines(ax: Axes, result: Result, values: Floats) -> None:
     for i, colour in enumerate(agent_colours(n)):
         width = 1.0 + 1.6 * (n - 1 - i) / max(n - 1, 1)
         name = f"agent-{i + 1}"
-        draw_line(ax, result.time, values[:, i], color=colour, linewidth=width, gid=name)
+        ax.plot(result.time, values[:, i], color=colour, linewidth=width, gid=name)
 
 
 def agent_handles(n: int, **look: Any) -> list[Line2D]:
@@ -547,7 +433,7 @@ def number_phases(axes: Iterable[Axes], result: Result) -> str:
         for i, (_, start, end) in enumerate(_phase_spans(ax, result)):
             label = _label_phase(ax, str(i + 1), start, end, fontsize=6.5)
             box = label.get_window_extent()
-            if box.x0 < right + 2 * _DOT:
+            if box.x0 < right + 0.02 * _DPI:
                 label.remove()
             else:
                 right = box.x1

@@ -64,7 +64,6 @@ def contents(
     pages = [_flight(*each) for each in zip(flights, judged, names, colours, strict=True)]
     # Trajectories that others made have no gains.
     controlled = any(each["gains"] is not None and each["gains"].rows for each in pages)
-    response = overlay.draw_responses(missions, names) if controlled else None
     # The summary has its own page.
     drawn = [name for name in plotting.figure_names(flights[0]) if name != "summary"]
     first: dict[str, Any] = {"brief": [], "sketch": None}
@@ -84,7 +83,6 @@ def contents(
         "keys": _keys_table(missions, names) if several else None,
         "overlays": _overlays(flights, names) if several else [],
         "controlled": controlled,
-        "response": None if response is None else _data_url(response),
         "version": __version__,
         "covers": _scope_in_words(flights),
     }

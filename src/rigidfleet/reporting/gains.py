@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from rigidfleet.math import lqr, pid
 
@@ -18,12 +18,8 @@ _SOLVERS = {
 }
 
 
-class GainLine(NamedTuple):
-    """One property of the gains: its name, its value and its meaning."""
-
-    what: str
-    value: str
-    meaning: str
+#: One property of the gains: its name, its value and its meaning.
+GainLine = tuple[str, str, str]
 
 
 def gain_lines(mission: Mission) -> list[GainLine]:
@@ -32,38 +28,28 @@ def gain_lines(mission: Mission) -> list[GainLine]:
     return [*constraint, *_tracking_lines(mission), *_regulator_lines(mission)]
 
 
-def error_response(mission: Mission, t: list[float]) -> list[float] | None:
-    """Error c(t)/c(0) of a distance with c'(0) = 0; None without stabilisation."""
-    c = mission.constraint
-    if c.stabilisation == "none" or not len(mission.edges):
-        return None
-    return pid.error_response(c.alpha, c.beta, c.gamma, 1.0, 0.0, 0.0, t)[0].tolist()
-
-
 def _constraint_lines(mission: Mission) -> list[GainLine]:
     c = mission.constraint
     lines = []
     if c.stabilisation == "none":
-        lines.append(GainLine("constraint force", "no feedback", "distance errors remain and grow"))
+        lines.append(("constraint force", "no feedback", "distance errors remain and grow"))
     else:
         gain = f"α = {c.alpha:.4g} /s, β = {c.beta:.4g} /s, γ = {c.gamma:.4g} /s³"
         poles = ", ".join(_pole(s) for s in pid.poles(c.alpha, c.beta, c.gamma))
         lines += [
-            GainLine("constraint feedback", gain, "a distance error c obeys c‴ + 2α c″ + β² c′ + γ c = 0"),
-            GainLine("poles of the error", f"{poles} /s", "all have negative real parts: every error decays"),
+            ("constraint feedback", gain, "a distance error c obeys c‴ + 2α c″ + β² c′ + γ c = 0"),
+            ("poles of the error", f"{poles} /s", "all have negative real parts: every error decays"),
         ]  # fmt: skip
         if c.gamma > 0:
             margin = 2 * c.alpha * c.beta**2 / c.gamma
             meaning = f"errors decay until γ reaches {margin:.3g} times its value (2αβ² > γ)"
-            lines.append(GainLine("stability margin", f"{margin:.3g}", meaning))
+            lines.append(("stability margin", f"{margin:.3g}", meaning))
         if (settled := c.settling_time) is not None:
             beyond = 100 * pid.overshoot(c.alpha, c.beta, c.gamma)
             why = "the integral must return to zero" if c.gamma > 0 else "there is no integral term"
             lines += [
-                GainLine("settling", f"{settled:.3g} s", "time until an error stays below 2 %"),
-                GainLine(
-                    "overshoot", f"{beyond:.3g} %", f"an error passes zero by this share: {why}"
-                ),
+                ("settling", f"{settled:.3g} s", "time until an error stays below 2 %"),
+                ("overshoot", f"{beyond:.3g} %", f"an error passes zero by this share: {why}"),
             ]
     setting = {
         "iterated": f"μ = {_damping(mission)}, {c.iterations} iterations",
@@ -72,11 +58,11 @@ def _constraint_lines(mission: Mission) -> list[GainLine]:
         "pinv": f"cut-off at {c.cutoff:g} of the largest w",
     }[c.solver]
     value = f"{c.solver} ({setting})" if setting else c.solver
-    lines.append(GainLine("solver", value, _SOLVERS[c.solver]))
+    lines.append(("solver", value, _SOLVERS[c.solver]))
     if any(phase.control != "tracking" for phase in mission.phases):
         rate = f"{c.deformation_damping:g} /s"
         meaning = "motions that change no distance decay at this rate while no slots are tracked"
-        lines.append(GainLine("deformation damping", rate, meaning))
+        lines.append(("deformation damping", rate, meaning))
     return lines
 
 
@@ -93,7 +79,7 @@ def _tracking_lines(mission: Mission) -> list[GainLine]:
     t = mission.tracking
     k1, k2 = lqr.double_integrator_gains(t.Q, t.R)
     meaning = f"each vehicle follows its slot: {_second_order(k1, k2)}"
-    return [GainLine("tracking", f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s", meaning)]
+    return [("tracking", f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s", meaning)]
 
 
 def _regulator_lines(mission: Mission) -> list[GainLine]:
@@ -107,14 +93,14 @@ def _regulator_line(name: str, regulator: Regulator) -> GainLine:
     if regulator.horizon == "infinite":
         k1, k2 = lqr.double_integrator_gains(regulator.Q, regulator.R)
         value = f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s"
-        return GainLine(f"{name}, infinite horizon", value, _second_order(k1, k2))
+        return (f"{name}, infinite horizon", value, _second_order(k1, k2))
     q, r, s = (_weights(w) for w in (regulator.Q, (regulator.R,), regulator.S))
     meaning = "gains rise towards arrival, where S weighs errors of position and velocity"
     if not any(regulator.Q):
         meaning = (
             "least acceleration to arrive; S weighs errors of position and velocity at arrival"
         )
-    return GainLine(f"{name}, finite horizon", f"Q = {q}, R = {r}, S = {s}", meaning)
+    return (f"{name}, finite horizon", f"Q = {q}, R = {r}, S = {s}", meaning)
 
 
 def _second_order(k1: float, k2: float) -> str:

@@ -1,4 +1,4 @@
-"""Figures that overlay several flights, one colour each, and the response of the gains."""
+"""Figures that overlay several flights, one colour each."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ import numpy as np
 from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.plotting import encode_figure
 from rigidfleet.plotting import style as st
-from rigidfleet.reporting import gains
 from rigidfleet.result.quantities import samples
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from rigidfleet.mission import Mission
     from rigidfleet.result import Result
 
 _WIDTHS = (2.6, 0.9)  # of lines, first flight to last: each remains visible under the next
@@ -29,7 +27,7 @@ def draw_paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
         above, height = fig.subplots(1, 2)
         for flight, look in zip(flights, _looks(flights), strict=True):
             above.plot(flight.cm[:, 0], flight.cm[:, 1], **look)
-            st.draw_line(height, flight.time, flight.cm[:, 2], **look)
+            height.plot(flight.time, flight.cm[:, 2], **look)
         above.set(xlabel="x, east [m]", ylabel="y, north [m]", title="centre of mass from above")
         above.set_aspect("equal", adjustable="datalim")
         above.margins(0.05)
@@ -51,7 +49,7 @@ def draw_over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
             known = False
             for flight, look in zip(flights, _looks(flights), strict=True):
                 values = samples(flight, name).worst
-                st.draw_line(ax, flight.time, values, **look)
+                ax.plot(flight.time, values, **look)
                 known |= bool(np.isfinite(values).any())
             q, logarithmic = QUANTITIES[name], name in ("tracking_error", "constraint")
             worst = "least" if q.at_least else "greatest"
@@ -72,35 +70,14 @@ def draw_over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
         return _svg(fig)
 
 
-def draw_responses(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None:
-    """Response of a distance error with c'(0) = 0 under each mission's gains, as an SVG."""
-    times = [s for m in missions if len(m.edges) and (s := m.constraint.settling_time) is not None]
-    if not times:
-        return None
-    t = np.linspace(0.0, 1.6 * max(times), 400)
-    with st.apply_style():
-        fig = st.blank_figure(st.WIDTH, 2.2, "constrained")
-        ax = fig.subplots()
-        ax.axhspan(-0.02, 0.02, color=st.BAND, linewidth=0)
-        for mission, look in zip(missions, _looks(missions), strict=True):
-            error = gains.error_response(mission, t.tolist())
-            if error is not None:
-                ax.plot(t, error, **look)
-        ax.axhline(0.0, color=st.GREY, linewidth=0.6)
-        ax.set(xlabel="time [s]", ylabel="error c(t) / c(0)", xlim=(0, t[-1]))
-        if len(missions) > 1:
-            _key(fig, missions, labels)
-        return _svg(fig)
-
-
-def _looks(flights: Sequence[object]) -> list[dict[str, Any]]:
+def _looks(flights: Sequence[Result]) -> list[dict[str, Any]]:
     """Colour and width of each flight's lines."""
     widths = np.linspace(*_WIDTHS, len(flights)) if len(flights) > 1 else [1.6]
     colours = st.agent_colours(len(flights))
     return [{"color": c, "linewidth": float(w)} for c, w in zip(colours, widths, strict=True)]
 
 
-def _key(fig: Figure, flights: Sequence[object], labels: Sequence[str]) -> None:
+def _key(fig: Figure, flights: Sequence[Result], labels: Sequence[str]) -> None:
     looks = zip(labels, _looks(flights), strict=True)
     handles = [st.legend_entry(st.clean_name(label), **look) for label, look in looks]
     fig.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4))

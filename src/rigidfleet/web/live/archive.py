@@ -1,14 +1,13 @@
-"""Samples of a flight by hand, at even steps and in bounded memory, worst moments included."""
+"""Samples of a flight by hand, at even steps and in bounded memory."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from rigidfleet.result import Result
 from rigidfleet.simulation.recording import Piece
 from rigidfleet.typing import Bools, Floats
 
@@ -16,18 +15,6 @@ from rigidfleet.typing import Bools, Floats
 #: it, every second sample is dropped, and the step doubles.
 _MOST = 3.0e7
 _JOINED = 256  # ticks joined into one piece: few large arrays instead of many small ones
-
-
-@dataclass
-class ArchivedPhase:
-    """Samples of a phase, up to the loss of a vehicle.
-
-    Its start, its end and its worst moments (least distance, greatest force) are kept at any step.
-    """
-
-    pieces: list[Piece] = field(default_factory=list)
-    #: The end, and the worst moments, with how bad each is.
-    moments: dict[str, tuple[float, Piece]] = field(default_factory=dict)
 
 
 class Archive:
@@ -40,31 +27,31 @@ class Archive:
 
     def __init__(self, step: float, most: float = _MOST) -> None:
         self.step, self.most = step, most
-        self.phases: dict[tuple[int, int], ArchivedPhase] = {}  # by phase and number of edges
+        # By phase and number of edges: its samples, and its end, which is kept at any step
+        self.phases: dict[tuple[int, int], list[Piece]] = {}
+        self.ends: dict[tuple[int, int], Piece] = {}
         self.size = 0
 
-    def add(self, pieces: Sequence[Piece], record: Result) -> None:
-        """Store the samples of a tick; ``record`` is that of its end."""
+    def add(self, pieces: Sequence[Piece]) -> None:
+        """Store the samples of a tick."""
         for piece in pieces:
-            archived = self.phases.setdefault((piece.phase, len(piece.edges)), ArchivedPhase())
-            keep = self._is_multiple(piece.time)
-            keep[0] |= not archived.moments  # the start
-            archived.moments["end"] = np.inf, select_rows(piece, [-1])
+            key = piece.phase, len(piece.edges)
+            kept, keep = self.phases.setdefault(key, []), self._is_multiple(piece.time)
+            keep[0] |= key not in self.ends  # the start
+            self.ends[key] = select_rows(piece, [-1])
             if keep.any():
-                archived.pieces.append(select_rows(piece, keep))
-                self.size += _size(archived.pieces[-1])
-            if len(archived.pieces) >= _JOINED and len(archived.pieces[-1].time) < _JOINED:
-                archived.pieces = [_join(archived.pieces)]
-            if piece is pieces[-1]:
-                _note_worst(archived.moments, record)
+                kept.append(select_rows(piece, keep))
+                self.size += _size(kept[-1])
+            if len(kept) >= _JOINED and len(kept[-1].time) < _JOINED:
+                kept[:] = [_join(kept)]
         while self.size > self.most:
             self._thin()
 
     def pieces(self) -> list[Piece]:
         """All stored samples, in order of time and without duplicates."""
         pieces = []
-        for archived in self.phases.values():
-            every = _join([*archived.pieces, *(piece for _, piece in archived.moments.values())])
+        for key, kept in self.phases.items():
+            every = _join([*kept, self.ends[key]])
             pieces.append(select_rows(every, np.unique(every.time, return_index=True)[1].tolist()))
         return pieces
 
@@ -80,31 +67,18 @@ class Archive:
     def _thin(self) -> None:
         """Double the step: drop every second sample."""
         self.step *= 2.0
-        for archived in self.phases.values():
-            whole = _join(archived.pieces)
+        for kept in self.phases.values():
+            whole = _join(kept)
             keep = self._is_multiple(whole.time)
             keep[0] = True  # the start
-            archived.pieces = [select_rows(whole, keep)]
-        self.size = sum(_size(archived.pieces[0]) for archived in self.phases.values())
+            kept[:] = [select_rows(whole, keep)]
+        self.size = sum(_size(kept[0]) for kept in self.phases.values())
         self.most = max(self.most, 2.0 * self.size if self.size > 0.5 * self.most else 0.0)
 
 
 def _size(piece: Piece) -> int:
     """Number of values in the record of a piece."""
     return sum(x.size for x in piece.record)
-
-
-def _note_worst(moments: dict[str, tuple[float, Piece]], record: Result) -> None:
-    """Keep the end of a tick if it is a worst moment of its phase."""
-    worst = {
-        "separation": -float(record.separation[-1]),
-        "clearance": -float(record.clearance[-1]),
-        "thrust": float(np.max(record.thrust[-1])),
-        "speed": float(np.linalg.norm(record.velocity[-1], axis=1).max()),
-    }
-    for name, value in worst.items():
-        if value > moments.get(name, (-np.inf,))[0]:
-            moments[name] = value, moments["end"][1]
 
 
 def select_rows(piece: Piece, which: Bools | list[int]) -> Piece:

@@ -296,7 +296,7 @@ class Pilot:
             now: dict[str, Any] = {"ending": "", "statistics": {}, "network": flight.network}
             self.last = assemble_result(flight.mission, phases, end, **now)
             self.last.mission = flight.mission  # with the balls, and not parsed again
-            self.archive.add(flight.pieces, self.last)
+            self.archive.add(flight.pieces)
         return self.last
 
     def result(self) -> Result:

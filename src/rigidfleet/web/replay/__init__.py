@@ -159,7 +159,7 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
     """Information on the page about a finished flight."""
     low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
     extent, reach = float(np.linalg.norm(high - low)) / 2, typical_reach(result)
-    seen = sight_points(result.mission, low, high, float(result.time[0]), float(result.time[-1]))
+    seen = sight_points(result.mission, low, high)
     least, most = seen.min(axis=0), seen.max(axis=0)
     way = (result.cm[-1] - result.cm[0])[:2]
     far = float(np.linalg.norm(way)) > 2 * reach

@@ -14,9 +14,8 @@ from rigidfleet.plotting.logged import off_plan
 from rigidfleet.plotting.quadrotors import has_rotors, rotor_forces, rotor_limits
 from rigidfleet.result import quantities
 from rigidfleet.result.lights import has_lights, lights
-from rigidfleet.solids.distance import displacement
 from rigidfleet.solids.outline import outline
-from rigidfleet.solids.records import Solids, extent
+from rigidfleet.solids.records import extent
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn
 
@@ -28,8 +27,8 @@ if TYPE_CHECKING:
 _LINES = 12  # greatest number of lines in a plot; for more agents, the least and the greatest value
 #: Greatest number of obstacles that an overview fits one by one; more are fitted together.
 _BOXES = 200
-#: Distance from the flight up to which obstacles that move are in sight, as a share of its length; places looked at.
-_BESIDE, _PLACES = 0.15, 100
+#: Distance from the flight up to which ways of obstacles are in sight, as a share of its length.
+_BESIDE = 0.15
 _FLOOR = 1e-6  # least constraint error that is distinguished from zero [m]
 
 
@@ -165,14 +164,11 @@ def _further_columns(
         yield "doubt", PackedColumn(off.doubt, fine)
 
 
-def sight_points(
-    mission: Mission, low: Floats, high: Floats, begin: float = 0.0, end: float = 0.0
-) -> Floats:
+def sight_points(mission: Mission, low: Floats, high: Floats) -> Floats:
     """Points (P, 3) [m] that an overview shows: 8 corners of the flight's box, then those of obstacles near it.
 
-    An obstacle is cut at the distance from the flight that equals the flight's length; one that moves counts where it
-    comes near. ``low`` and ``high`` (3,) are the flight's least and greatest coordinates [m], from ``begin`` to ``end``
-    [s].
+    An obstacle is cut at the distance from the flight that equals the flight's length, the way of one that moves
+    nearer. ``low`` and ``high`` (3,) are the flight's least and greatest coordinates [m].
     """
     reach = max(float(np.linalg.norm(high - low)), 1e-6)
     boxes = []
@@ -180,10 +176,7 @@ def sight_points(
         ends = extent(box.solid)
         if box.kind == "heights":
             ends[0, 2] = box.solid.heights.min()
-        far = reach
-        if box.solid.moves:
-            ends, far = _box_of_passing(box.solid, low, high, begin, end), _BESIDE * reach
-        boxes.append((*ends, far))
+        boxes.append((*ends, reach * (_BESIDE if box.solid.moves else 1.0)))
     for area in _areas(mission):
         flat, (floor, ceiling) = np.concatenate(area["rings"]), area["heights"]
         heights = low[2] if floor is None else floor, high[2] if ceiling is None else ceiling
@@ -195,19 +188,6 @@ def sight_points(
     ends = np.array([(low, high), *seen])  # (1 + boxes, 2, 3)
     pick = np.indices((2, 2, 2)).reshape(3, 8)  # corners
     return np.stack([ends[:, pick[a], a] for a in range(3)], axis=2).reshape(-1, 3)
-
-
-def _box_of_passing(solid: Solids, low: Floats, high: Floats, begin: float, end: float) -> Floats:
-    """Lowest and highest corner (2, 3) [m] of a solid that moves, where it is near a box while it is there."""
-    since, until = np.clip(solid.there[0], begin, end)
-    still = extent(solid._replace(times=np.zeros(0), ways=np.zeros((0, 3))))
-    ways = np.stack(displacement(np.linspace(since, until, _PLACES), 0, solid), axis=-1)
-    ends = still[:, None] + ways  # (2, places, 3)
-    far = _BESIDE * float(np.linalg.norm(high - low))
-    near = ((ends[0] <= high + far) & (ends[1] >= low - far)).all(axis=1)
-    if not near.any():
-        return np.array([[np.inf] * 3, [-np.inf] * 3])
-    return np.array([ends[0][near].min(axis=0), ends[1][near].max(axis=0)])
 
 
 def thrust_directions(force: Floats, mass: Floats) -> Floats:
