@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from vehicle_samples import PAPER, ROTORPY, G, begun, planned, rotorpy
+from vehicle_samples import PAPER, ROTORPY, G, begun, derivatives, planned, rotorpy
 
 from rigidfleet.kernel import fleet, records
 from rigidfleet.kernel.engine import native, sampled
@@ -158,7 +158,7 @@ def test_samples_and_trail_follow_the_flight():
         np.testing.assert_allclose(path[24:].reshape(8, 3), b.S[c, :, 3:6], rtol=0, atol=1e-7)
     np.testing.assert_allclose(a.dS[..., :3], a.S[..., 3:6], rtol=0, atol=1e-15)
     np.testing.assert_allclose(
-        a.dS[3], sampled.derivatives(coarse[2], a.S[3], a.command[3]), rtol=0, atol=1e-12
+        a.dS[3], derivatives(coarse[2], a.S[3], a.command[3]), rtol=0, atol=1e-12
     )
 
 
