@@ -148,7 +148,7 @@ def compiled_flight(mission: Mission, tolerance: float = TOLERANCE) -> Callable[
 
     def fly() -> np.ndarray:
         state.y[:], state.clock[:], state.count[:] = start.y, start.clock, start.count
-        native.integrate(plan.problem, work, state, DURATION, True, times, samples, 1 << 40)
+        native.Integration(plan.problem, work, state, DURATION, times, samples)(True, 1 << 40)
         return samples
 
     return fly

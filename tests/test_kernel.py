@@ -702,7 +702,7 @@ def fixed_steps(h: float, t_end: float, sampled: np.ndarray) -> tuple[np.ndarray
     for step in range(round(t_end / h)):
         state.clock[1] = h  # whatever the step control would like
         fresh = step == 0
-        native.integrate(problem, w, state, t_end + 1.0, fresh, sampled, samples, 1)
+        native.Integration(problem, w, state, t_end + 1.0, sampled, samples)(fresh, 1)
     assert state.clock[0] == pytest.approx(t_end)
     return state.y, samples
 
@@ -740,9 +740,8 @@ def test_error_follows_the_tolerance():
     errors = []
     for rtol in (1e-5, 1e-7, 1e-9, 1e-11):
         state = records.integrator(exact(0.0), 0.0, rtol=rtol, atol=np.full(17, rtol / 100))
-        status = native.integrate(
-            problem, w, state, 5.0, True, np.zeros(0), np.zeros((0, 17)), 100_000
-        )
+        unsampled = np.zeros(0), np.zeros((0, 17))
+        status = native.Integration(problem, w, state, 5.0, *unsampled)(True, 100_000)
         assert status == records.FINISHED
         assert state.clock[0] == 5.0
         errors.append(np.abs(state.y - exact(5.0)).max())
@@ -761,7 +760,8 @@ def test_a_flight_that_pauses_goes_on_as_if_it_had_not(pause):
     def fly(steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
         state = records.integrator(y0, 0.0, rtol=1e-8, atol=np.full(21, 1e-10))
         samples, w, pauses, fresh = np.zeros((121, 21)), workspace(3, 3), 0, True
-        while native.integrate(problem, w, state, 6.0, fresh, times, samples, steps):
+        go_on = native.Integration(problem, w, state, 6.0, times, samples)
+        while go_on(fresh, steps):
             fresh = False
             pauses += 1
         return state.y, samples, state.count, pauses

@@ -19,6 +19,7 @@ from vehicle_samples import (
     ROTORPY,
     G,
     begun,
+    derivatives,
     from_crazyflow,
     random_inputs,
     random_states,
@@ -38,7 +39,7 @@ NO_AIR = {"rotor_drag": (0, 0), "lift": 0.0, "c": (0, 0, 0)}
 
 def derivative(vehicle: fleet.VehicleDynamics, S, command, wind) -> np.ndarray:
     flight = fleet.ideal_flight(fleet.quadrotors([vehicle] * len(S), G), start=0.0, h=1e-3, steps=1)
-    return sampled.derivatives(flight, np.array(S), np.array(command), np.array(wind))
+    return derivatives(flight, np.array(S), np.array(command), np.array(wind))
 
 
 def by_rotors(flight: fleet.SampledFlight) -> fleet.SampledFlight:
@@ -323,7 +324,7 @@ def test_ground_effect():
     _, _, flight, state = begun([vehicle], [[0, 0, 1.0 + z]])
     flight = flight._replace(air=flight.air._replace(ground_effect=True, ground=1.0))
     command = state.S[:, 13:]
-    a = sampled.derivatives(flight, state.S, command)[0, 5]
+    a = derivatives(flight, state.S, command)[0, 5]
     assert a == pytest.approx(G * (ratio - 1.0), rel=1e-9)
     assert 1.05 < ratio < 1.3
     heights = [0.01, 0.05, 0.1, 0.3, 3.0]

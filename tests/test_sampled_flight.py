@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from vehicle_samples import PAPER, ROTORPY, G, begun, planned, rotorpy
+from vehicle_samples import PAPER, ROTORPY, G, begun, derivatives, planned, rotorpy
 
 from rigidfleet.kernel import fleet, records
 from rigidfleet.kernel.engine import native, sampled
@@ -158,7 +158,7 @@ def test_samples_and_trail_follow_the_flight():
         np.testing.assert_allclose(path[24:].reshape(8, 3), b.S[c, :, 3:6], rtol=0, atol=1e-7)
     np.testing.assert_allclose(a.dS[..., :3], a.S[..., 3:6], rtol=0, atol=1e-15)
     np.testing.assert_allclose(
-        a.dS[3], sampled.derivatives(coarse[2], a.S[3], a.command[3]), rtol=0, atol=1e-12
+        a.dS[3], derivatives(coarse[2], a.S[3], a.command[3]), rtol=0, atol=1e-12
     )
 
 
@@ -198,9 +198,8 @@ def test_points_fly_as_in_the_adaptive_integrator():
     y = np.concatenate([position.ravel(), np.zeros(9 + m)])
     start = planned("narrow-passage", 0, POINT)[2].start
     state = records.integrator(y, start, rtol=1e-10, atol=np.full(len(y), 1e-10))
-    native.integrate(
-        problem, work, state, start + 4.0, True, np.zeros(0), np.zeros((0, len(y))), 1 << 30
-    )
+    unsampled = np.zeros(0), np.zeros((0, len(y)))
+    native.Integration(problem, work, state, start + 4.0, *unsampled)(True, 1 << 30)
     errors = []
     for h in (4e-3, 2e-3, 1e-3):
         given = planned("narrow-passage", 0, POINT, h=h)
@@ -341,9 +340,8 @@ def test_the_body_law_and_its_frame():
     y = plan.initial_state()
     work = workspace(3, 3, solver=plan.problem.law.solver)
     state = records.integrator(y, 6.0, rtol=1e-10, atol=np.full(len(y), 1e-10))
-    native.integrate(
-        plan.problem, work, state, 12.0, True, np.zeros(0), np.zeros((0, len(y))), 1 << 30
-    )
+    unsampled = np.zeros(0), np.zeros((0, len(y)))
+    native.Integration(plan.problem, work, state, 12.0, *unsampled)(True, 1 << 30)
     apart, turned = [], []
     for h in (8e-3, 4e-3, 2e-3):
         fleet_ = fleet.quadrotors([POINT] * 3, G)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet.kernel import fleet
+from rigidfleet.kernel import fleet, quadrotor
 from rigidfleet.kernel.engine import packing
 from rigidfleet.kernel.problem import (
     OPEN,
@@ -36,6 +36,22 @@ FROZEN = Path(__file__).with_name("frozen_vehicles.json")
 G = 9.81
 HALF = 0.70710678118  # as RotorPy writes the cosine of 45 deg
 SQUARE = HALF * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]])
+
+
+def derivatives(
+    flight: fleet.SampledFlight,
+    S: np.ndarray,
+    command: np.ndarray,
+    air: np.ndarray | None = None,
+) -> np.ndarray:
+    """Derivatives (N, 17) of states by the equations of motion; commands (N, 4), in still air or one that moves."""
+    out, none = np.empty_like(S), np.zeros(3)
+    for i in range(len(S)):
+        wind = none if air is None else air[i]
+        quadrotor.derivative(
+            S[i], command[i], i, flight.vehicles, flight.air, wind, none, np.eye(3), out[i]
+        )
+    return out
 
 
 def lag(tau: float) -> tuple[float, ...]:

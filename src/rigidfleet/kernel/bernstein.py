@@ -157,10 +157,7 @@ def shortest_length(curve, floor, work, pieces):
     are examined again once their least length is roughly known.
     """
     best, at, top, count = floor, -1.0, 0, 0
-    for k in range(5):
-        for q in range(3):
-            pieces[0, 3 * k + q] = curve[k, q]
-    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
+    stack_curve(curve, pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
         middle, along, size = 0.0, math.inf, 0.0

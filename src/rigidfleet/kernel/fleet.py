@@ -306,17 +306,6 @@ class SampledSegment(NamedTuple):
     stamp: Ints  # (K, L) tick at which the newest message of each link was sent
 
 
-class Evaluation(NamedTuple):
-    """States of vehicles, and their derivatives."""
-
-    S: Floats  # (N, 17)
-    command: Floats  # (N, 4)
-    air: Floats  # (N, 3) [m/s]
-    push: Floats  # (N, 3) [N]
-    T: Floats  # (3, 3) work
-    dS: Floats  # (N, 17), written
-
-
 # Turbulent jet below a hovering quadrotor: decay and spread of its far field, and its virtual origin in distances of
 # opposite motors (Bauersfeld et al. 2024, arXiv:2403.13321, the ninth equation).
 _DECAY, _SPREAD, _ORIGIN = 10.11, 0.07668, -5.817

@@ -46,7 +46,7 @@ from rigidfleet.kernel.moving import (
     write_stop_beside,
 )
 from rigidfleet.kernel.rigid_body import attitude_matrix
-from rigidfleet.kernel.sampled_flight import path_at
+from rigidfleet.kernel.sampled_flight import write_measured_states
 from rigidfleet.kernel.segments import (
     hull_distance,
     least_along,
@@ -563,10 +563,8 @@ def guard_forces(p, w, flight, state, a):
     r, v, k = a.known[0], a.known[1], state.count[FLIGHT_TICKS]
     if a.filtered:
         subtract_released_forces(p, w, state, a)
+    write_measured_states(k, r, v, flight, state)
     for i in range(n):
-        for q in range(3):
-            r[i, q] = state.seen[i, q] + path_at(k, i, q, flight.tables)
-            v[i, q] = state.seen[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
         wanted_acceleration(i, state, a)
         if a.soft[i] > 0.0:
             move_to_obedient_point(i, flight.vehicles, state, r[i], v[i], a)

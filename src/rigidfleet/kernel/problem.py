@@ -5,9 +5,9 @@ compiled with the extents that types of arrays declare here, and once more with 
 """
 
 import math
-from functools import lru_cache
+from functools import cache
 from itertools import accumulate
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,18 @@ from rigidfleet.typing import Bools, Edges, Floats
 
 
 class Extents(tuple[int | str | None, ...]):
-    """Extents of an array: numbers, or "N", "m", "P" pairs of edges, "A" unknowns of the multipliers; None: any."""
+    """Extents of an array: numbers, or "N", "m", "P" pairs of edges, "A" unknowns of the multipliers; None: any.
+
+    "V" and "H" are those of arrays that only some laws need.
+    """
+
+
+@cache
+def extents_of(kind: type) -> dict[str, Extents]:
+    """Declared extents of the arrays of a type of named tuple."""
+    hints = get_type_hints(kind, include_extras=True)
+    about = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
+    return {name: x for name, known in about.items() for x in known if isinstance(x, Extents)}
 
 
 PerAgent = Annotated[Floats, Extents(("N",))]
@@ -206,7 +217,7 @@ class Workspace(NamedTuple):
     b: PerEdge  # right side of the multiplier equation [m/s^2]
     # J M^-1 J^T (m, m), or J^T J (3N, 3N); its lower triangle is factored in place
     A: Annotated[Floats, Extents(("A", "A"))]
-    V: Floats  # (m, m) eigenvectors, if a law needs them
+    V: Annotated[Floats, Extents(("V", "V"))]  # (m, m) eigenvectors, if a law needs them
     w: PerEdge  # eigenvalues; work
     multiplier: PerEdge  # [N]
     f_E: Places  # gravity, the user's force and disturbances [N]
@@ -232,9 +243,9 @@ class Workspace(NamedTuple):
     T_ref: Matrix  # world -> body, of the reference motion
     # commanded: force, torque about the CM, world [N, N m]
     wrench: Annotated[Floats, Extents((6,))]
-    H: Floats  # (3N, 3N) normal matrix of the paper's H; work
-    H_V: Floats  # (3N, 3N)
-    H_w: Floats  # (2, 3N): right side, eigenvalues
+    H: Annotated[Floats, Extents(("H", "H"))]  # (3N, 3N) normal matrix of the paper's H; work
+    H_V: Annotated[Floats, Extents(("H", "H"))]  # (3N, 3N)
+    H_w: Annotated[Floats, Extents((2, "H"))]  # right side, eigenvalues
 
 
 def septic_polynomial(x):
@@ -260,9 +271,15 @@ def workspace(
     """
     size = 0 if large else min(m, 3 * n) if solver == ITERATED else m
     vectors = 0 if large or solver in (ITERATED, EXACT) else m
-    places, length = _side_by_side(n, m, size, vectors, 3 * n if with_h else 0)
-    memory = zeros(length)
-    w = Workspace(*[memory[part].reshape(shape) for part, shape in places])
+    sizes: dict[Any, int] = {"N": n, "m": m, "A": size, "V": vectors, "H": 3 * n if with_h else 0}
+    shapes = [
+        tuple(x if isinstance(x, int) else sizes[x] for x in extents)
+        for extents in extents_of(Workspace).values()
+    ]
+    # Side by side in one memory, each aligned to a cache line.
+    *starts, length = accumulate((padded(math.prod(shape)) for shape in shapes), initial=0)
+    places, memory = zip(starts, shapes, strict=True), zeros(length)
+    w = Workspace(*[memory[k : k + math.prod(shape)].reshape(shape) for k, shape in places])
     w.T[:] = w.T_ref[:] = np.eye(3)
     return w
 
@@ -270,28 +287,6 @@ def workspace(
 def padded(count: int) -> int:
     """``count`` rounded up to a multiple of 8: the numbers in a cache line, and the lanes of a `lanes` value."""
     return -(-count // 8) * 8
-
-
-@lru_cache(64)
-def _side_by_side(
-    n: int, m: int, size: int, vectors: int, k: int
-) -> tuple[list[tuple[slice, tuple[int, ...]]], int]:
-    """Place and shape of each array of a `Workspace` in one memory, aligned to a cache line; its length."""
-    agents, edges, space = (n, 3), (m,), (3, 3)
-    shapes: dict[str, tuple[int, ...]] = {
-        "r": agents, "v": agents, "r_seen": agents, "v_seen": agents, "u": (m, 3), "L": edges, "d": edges,
-        "d_dot": edges, "d_ddot": edges, "c": edges, "b": edges, "A": (size, size), "V": (vectors, vectors),
-        "w": edges, "multiplier": edges, "f_E": agents, "f_u": agents, "f_C": agents, "f_D": agents, "a": agents,
-        "p": agents, "p_dot": agents, "p_ddot": agents, "r_ref": agents, "v_ref": agents, "a_ref": agents,
-        "cm": (5, 3), "I": space, "I_inv": space, "T": space, "body": (8, 3), "gain": (4,), "E": space,
-        "T_ref": space, "wrench": (6,), "H": (k, k), "H_V": (k, k), "H_w": (2, k),
-    }  # fmt: skip
-    sizes = [math.prod(shapes[name]) for name in Workspace._fields]
-    *starts, length = accumulate(map(padded, sizes), initial=0)
-    parts = [slice(start, start + size) for start, size in zip(starts, sizes, strict=True)]
-    return [
-        (part, shapes[name]) for name, part in zip(Workspace._fields, parts, strict=True)
-    ], length
 
 
 def no_disturbance(masses: Floats) -> Disturbance:

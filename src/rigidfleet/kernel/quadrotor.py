@@ -154,13 +154,3 @@ def normalise(q):
     scale = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     for k in range(4):
         q[k] *= scale
-
-
-@jit
-def evaluate(flight, call):
-    """Derivatives of all vehicles, see `fleet.Evaluation`."""
-    for i in range(call.S.shape[0]):
-        derivative(
-            call.S[i], call.command[i], i, flight.vehicles, flight.air, call.air[i], call.push[i], call.T, call.dS[i]
-        )  # fmt: skip
-    return 0

@@ -197,7 +197,7 @@ def record_if_worse(i, kind, value, t, state):
 @jit
 def write_knowledge(k, t, p, w, flight, state):
     """What each vehicle knows at tick k, time t [s], into w: its measured state and, by one clock, the plan."""
-    write_measured_states(k, w, flight, state)
+    write_measured_states(k, w.r, w.v, flight, state)
     if not flight.clocks.own:
         evaluate_plan(t, p, w)
 
@@ -257,19 +257,19 @@ def evaluate_plan(t, p, w):
 
 
 @jit
-def write_measured_states(k, w, flight, state):
-    """Measured states of vehicles at tick k, each of its own, into w.r and w.v."""
+def write_measured_states(k, r, v, flight, state):
+    """Measured states of vehicles at tick k, each of its own, into r and v (N, 3)."""
     for i in range(state.S.shape[0]):
         for q in range(3):
-            w.r[i, q] = state.seen[i, q] + path_at(k, i, q, flight.tables)
-            w.v[i, q] = state.seen[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
+            r[i, q] = state.seen[i, q] + path_at(k, i, q, flight.tables)
+            v[i, q] = state.seen[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
 
 
 @jit
 def post_messages(k, p, w, flight, state):
     """Have ready what each vehicle could send at tick k: what it knows of itself, and what it does."""
     mail, row = state.mail, k % state.mail.due.shape[1]
-    write_measured_states(k, w, flight, state)
+    write_measured_states(k, w.r, w.v, flight, state)
     for i in range(state.S.shape[0]):
         message, m = mail.post[row, i], p.vehicles.inverse[i]
         for q in range(3):

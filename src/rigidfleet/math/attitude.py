@@ -255,15 +255,9 @@ def rotation_vector_rate(phi: ArrayLike, omega: ArrayLike) -> Floats:
     x = |phi|. It is singular at full turns, x = 2 pi; keep |phi| <= pi.
     """
     phi, omega = _vectors("phi", phi, 3), _vectors("omega", omega, 3)
-    if phi.ndim == omega.ndim == 1:
-        return np.array(vector_rate(*phi.tolist(), *omega.tolist()))
-    x = np.linalg.norm(phi, axis=-1, keepdims=True)
-    small = x < 0.05
-    safe = np.where(small, 1.0, x)
-    series = 1 / 12 + x**2 / 720 + x**4 / 30240
-    k = np.where(small, series, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
-    turn = np.cross(phi, omega)
-    return omega + 0.5 * turn + k * np.cross(phi, turn)
+    with np.errstate(invalid="ignore"):
+        rates = _rates(*np.moveaxis(phi, -1, 0), *np.moveaxis(omega, -1, 0))
+    return np.stack(rates, axis=-1).astype(np.float64)
 
 
 def vector_rate(
@@ -280,6 +274,9 @@ def vector_rate(
     return (
         p + 0.5 * a + k * (y * c - z * b), q + 0.5 * b + k * (z * a - x * c), r + 0.5 * c + k * (x * b - y * a)
     )  # fmt: skip
+
+
+_rates = np.frompyfunc(vector_rate, 6, 3)
 
 
 def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Floats:

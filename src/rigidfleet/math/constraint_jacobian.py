@@ -16,7 +16,11 @@ def jacobian(points: ArrayLike, edges: ArrayLike) -> Floats:
 
     A row is not finite if its agents are at the same place.
     """
-    p, i, j, u = _directions(points, edges)
+    p = np.asarray(points, dtype=np.float64)
+    i, j = np.asarray(edges, dtype=np.int64).reshape(-1, 2).T
+    u = p[..., i, :] - p[..., j, :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u /= np.linalg.norm(u, axis=-1, keepdims=True)
     row = np.arange(len(i))
     # Agents of an edge first, samples last, so that an assignment is one pass.
     J = np.zeros((len(i), p.shape[-2], *p.shape[:-2], p.shape[-1]))
@@ -24,16 +28,6 @@ def jacobian(points: ArrayLike, edges: ArrayLike) -> Floats:
     J[row, j] = -J[row, i]
     J = np.moveaxis(J, (0, 1), (-3, -2))
     return J.reshape(*p.shape[:-2], len(i), p.shape[-2] * p.shape[-1])
-
-
-def _directions(points: ArrayLike, edges: ArrayLike) -> tuple[Floats, Ints, Ints, Floats]:
-    """Points (..., N, d), the two ends (m,) of each edge, and its unit vectors (..., m, d)."""
-    p = np.asarray(points, dtype=np.float64)
-    i, j = np.asarray(edges, dtype=np.int64).reshape(-1, 2).T
-    u = p[..., i, :] - p[..., j, :]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u /= np.linalg.norm(u, axis=-1, keepdims=True)
-    return p, i, j, u
 
 
 def filter_factors(
@@ -82,12 +76,7 @@ def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = N
     if len(r) > some:
         parts = [r[k : k + some] for k in range(0, len(r), some)]
         return np.concatenate([smallest_singular_value(part, edges, masses) for part in parts])
-    if masses is not None or len(edges) > 3 * r.shape[1]:
-        return smallest_value(jacobian(r, edges), masses)
-    # J J^T without J: the cosine between two edges, if they meet.
-    _, i, j, u = _directions(r, edges)
-    B = np.eye(r.shape[1])[i] - np.eye(r.shape[1])[j]
-    return _root_of_least(u @ u.swapaxes(1, 2) * (B @ B.T))
+    return smallest_value(jacobian(r, edges), masses)
 
 
 def smallest_value(J: Floats, masses: ArrayLike | None = None) -> Floats:
@@ -96,13 +85,8 @@ def smallest_value(J: Floats, masses: ArrayLike | None = None) -> Floats:
         m = np.asarray(masses, dtype=float)
         J = J * np.repeat(np.sqrt(m.mean() / m), 3)
     # The smaller Gram matrix takes a third of the time of a decomposition of J itself.
-    return _root_of_least(
-        J @ J.swapaxes(1, 2) if J.shape[1] <= J.shape[2] else J.swapaxes(1, 2) @ J
-    )
-
-
-def _root_of_least(gram: Floats) -> Floats:
-    """Root of the smallest non-zero eigenvalue (K,) of Gram matrices (K, n, n), which are overwritten."""
+    turned = J.swapaxes(1, 2)
+    gram = J @ turned if J.shape[1] <= J.shape[2] else turned @ J
     known = np.isfinite(gram).all(axis=(1, 2))
     gram[~known] = 0.0
     w = np.linalg.eigvalsh(gram)

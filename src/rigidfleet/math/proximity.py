@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple, Protocol
 
@@ -50,39 +50,42 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
 
     Parameters: r (K, N, 3) [m], radius (N,) [m]. For a single agent: infinity and (-1, -1).
     """
-    n = r.shape[1]
     radius = np.asarray(radius, dtype=float)
-    least, pair = np.full(len(r), np.inf), np.full((2, len(r)), -1).T
-    if n > _MANY:
-        whole = np.isfinite(r.reshape(len(r), -1)).all(axis=1)
-        if whole.all():
-            return _closest_of_many(r, radius)
-        least[whole], pair[whole] = _closest_of_many(r[whole], radius)
-        for k in np.flatnonzero(~whole):  # agents without a position do not affect the others
-            who = np.flatnonzero(np.isfinite(r[k]).all(axis=1))
-            if len(who) > 1:
-                least[k : k + 1], near = _closest_of_many(r[k : k + 1, who], radius[who])
-                pair[k] = who[near[0]]
-        return least, pair
+    left: Bools = np.logical_and.reduce(np.isfinite(r), axis=2)
+    if not left.all():  # agents without a position do not affect the others
+        return separation_of_left(r, radius, left)
+    if r.shape[1] > _MANY:
+        return _closest_of_many(r, radius)
+
+    def apart(d: Floats, radii: Floats) -> Floats:
+        return root_of_squares(d) - radii
+
+    return _least_of_pairs(r, radius, apart)
+
+
+def _least_of_pairs(
+    r: Floats, radius: Floats, measure: Callable[[Floats, Floats], Floats]
+) -> tuple[Floats, Ints]:
+    """Least of a measure over all pairs of agents r (K, N, 3) at each sample (K,), and the pair (K, 2).
+
+    ``measure`` (m, K) is of how the pairs are apart (3, m, K), which it may overwrite, and of sums of radii (m, 1).
+    Infinity is of no pair, (-1, -1).
+    """
+    least, pair = np.full(len(r), np.inf), np.full((2, len(r)), -1)
     x, samples = np.ascontiguousarray(r.T), np.arange(len(r))  # rows of samples are faster
-    i, j = pairs = all_pairs(n)
+    pairs = all_pairs(r.shape[1])
     some = max(1, CACHED // max(1, 3 * len(r)))
-    for first in range(0, len(i), some):
-        part = slice(first, first + some)
-        d = x.take(j[part], axis=1)
-        d -= x.take(i[part], axis=1)
-        apart = root_of_squares(d)
-        apart -= (radius[i] + radius[j])[part, None]
-        at, value = apart.argmin(axis=0), apart.min(axis=0)
-        if np.isnan(value).any():  # of agents without a position
-            at = np.where(np.isnan(apart), np.inf, apart).argmin(axis=0)
-            value = apart[at, samples]
-        closer = value < least  # false for NaN
-        if closer.all():
-            least, pair = value, pairs.take(at + first, axis=1).T
-        else:
-            least[closer], pair[closer] = value[closer], pairs[:, at + first].T[closer]
-    return least, pair
+    for first in range(0, pairs.shape[1], some):
+        i, j = part = pairs[:, first : first + some]
+        d = x.take(j, axis=1)
+        d -= x.take(i, axis=1)
+        values = measure(d, (radius[i] + radius[j])[:, None])
+        at = values.argmin(axis=0)
+        value = values[at, samples]
+        closer = value < least
+        np.copyto(least, value, where=closer)
+        np.copyto(pair, part.take(at, axis=1), where=closer)
+    return least, pair.T
 
 
 @lru_cache(16)
@@ -181,34 +184,20 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
     An agent is below another if they overlap as seen from above. Infinity and (-1, -1) if there is no such pair.
     r (K, N, 3) [m], radius (N,); ``among`` (K, N) selects agents, all by default.
     """
-    n = r.shape[1]
     radius = np.asarray(radius, dtype=float)
-    least, pair = np.full(len(r), np.inf), np.full((2, len(r)), -1).T
     if among is not None and not among.all():
         r = np.where(among[:, :, None], r, np.nan)
-    if n > _MANY:
+    if r.shape[1] > _MANY:
+        least, pair = np.empty(len(r)), np.empty((len(r), 2), dtype=np.int64)
         for k, points in enumerate(r):
             least[k], pair[k] = _least_headroom(points, radius)
         return least, pair
-    x = np.ascontiguousarray(r.T)
-    i, j = all_pairs(n)
-    some = max(1, CACHED // max(1, 3 * len(r)))
-    for first in range(0, len(i), some):
-        part = slice(first, first + some)
-        radii = (radius[i] + radius[j])[part]
-        d = x[:2].take(j[part], axis=1)
-        d -= x[:2].take(i[part], axis=1)
-        d *= d
-        d[0] += d[1]
-        overlap = d[0] <= (radii**2)[:, None]  # false for agents without a position
-        for k in np.flatnonzero(overlap.any(axis=1)).tolist():
-            a, b = i.item(first + k), j.item(first + k)
-            height = abs(x[2, b] - x[2, a]) - radii[k]
-            lower = overlap[k] & (height < least)
-            np.copyto(least, height, where=lower)
-            np.copyto(pair[:, 0], a, where=lower)
-            np.copyto(pair[:, 1], b, where=lower)
-    return least, pair
+
+    def height(d: Floats, radii: Floats) -> Floats:
+        overlap = d[0] ** 2 + d[1] ** 2 <= radii**2  # false for agents without a position
+        return np.where(overlap, np.abs(d[2]) - radii, np.inf)
+
+    return _least_of_pairs(r, radius, height)
 
 
 def _least_headroom(r: Floats, radius: Floats) -> tuple[float, Ints]:

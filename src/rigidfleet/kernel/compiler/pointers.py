@@ -14,8 +14,7 @@ size of the same translation, if `keep_extents` was called before it.
 import hashlib
 import re
 from collections.abc import Mapping
-from functools import cache
-from typing import Any, get_type_hints
+from typing import Any
 
 from llvmlite import ir
 from numba import types
@@ -30,7 +29,7 @@ from numba.extending import (
 )
 
 from rigidfleet.kernel.compiler.simd import WIDTH, lanes
-from rigidfleet.kernel.problem import Extents
+from rigidfleet.kernel.problem import extents_of
 
 _WORD = ir.IntType(64)
 _ADDRESS = _WORD.as_pointer()
@@ -95,7 +94,7 @@ def _read_field(context: Any, builder: Any, kind: Any, address: Any, name: str) 
     if isinstance(field, types.Array):
         array = context.make_array(field)(context, builder)
         array.data = _load(builder, address, first, array.data.type)
-        extents = _extents_of(kind.to.instance_class).get(name, (None,) * field.ndim)
+        extents = extents_of(kind.to.instance_class).get(name, (None,) * field.ndim)
         shape = [_extent(builder, address, first + 1 + k, x) for k, x in enumerate(extents)]
         return _array_at(context, builder, field, array, shape)
     if field == types.boolean:
@@ -112,14 +111,6 @@ def _load(builder: Any, address: Any, word: int, kind: ir.Type = _WORD) -> Any:
     loaded = builder.load(place, align=8)
     loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
     return loaded
-
-
-@cache
-def _extents_of(kind: type) -> dict[str, Extents]:
-    """Declared extents of the arrays of a type of named tuple."""
-    hints = get_type_hints(kind, include_extras=True)
-    about = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
-    return {name: x for name, known in about.items() for x in known if isinstance(x, Extents)}
 
 
 def _extent(builder: Any, address: Any, word: int, declared: int | str | None) -> Any:

@@ -268,8 +268,27 @@ def fly_all(
     ValueError
         The problem does not fit vectors, see `fits`.
     """
+
+    def begin_alone() -> Callable[..., None]:
+        d0 = problem.reference.d0.copy()
+        own = problem._replace(reference=problem.reference._replace(d0=d0))
+        w = workspace(len(problem.vehicles.m), len(d0), solver=problem.law.solver)
+        unsampled = np.zeros(0), np.zeros((0, starts.shape[1]))
+
+        def work(
+            starts: Floats, before: Floats, ends: Floats, status: Ints, evaluations: Ints
+        ) -> None:
+            for k, start in enumerate(starts):
+                d0[:] = before[k]
+                state = integrator(start, times[0], rtol=rtol, atol=atol, step=_FIRST_STEP)
+                integration = native.Integration(own, w, state, times[1], *unsampled)
+                status[k] = integration(True, max_steps)
+                ends[k], evaluations[k] = state.y, state.count[EVALUATIONS]
+
+        return work
+
     if not vectors:
-        return _fly_alone(problem, starts, before, times, rtol, atol, max_steps, threads)
+        return _share(begin_alone, starts, before, threads)
     if not fits(problem):
         raise ValueError("flights of this problem cannot share vectors; use vectors=False")
     count, n = starts.shape
@@ -305,41 +324,9 @@ def fly_all(
     evaluations = np.repeat(ends.evaluations, WIDTH)[:count]
     lost = ~finished
     if lost.any():
-        again = _fly_alone(
-            problem, starts[lost], before[lost], times, rtol, atol, max_steps, threads
-        )
+        again = _share(begin_alone, starts[lost], before[lost], threads)
         y[lost], finished[lost], evaluations[lost] = again.y, again.finished, again.evaluations
     return FinalStates(y, finished, evaluations)
-
-
-def _fly_alone(
-    problem: Problem,
-    starts: Floats,
-    before: Floats,
-    times: tuple[float, float],
-    rtol: float,
-    atol: Floats,
-    max_steps: int,
-    threads: int,
-) -> FinalStates:
-    def begin() -> Callable[..., None]:
-        d0 = problem.reference.d0.copy()
-        own = problem._replace(reference=problem.reference._replace(d0=d0))
-        w = workspace(len(problem.vehicles.m), len(d0), solver=problem.law.solver)
-        unsampled = np.zeros(0), np.zeros((0, starts.shape[1]))
-
-        def work(
-            starts: Floats, before: Floats, ends: Floats, status: Ints, evaluations: Ints
-        ) -> None:
-            for k, start in enumerate(starts):
-                d0[:] = before[k]
-                state = integrator(start, times[0], rtol=rtol, atol=atol, step=_FIRST_STEP)
-                status[k] = native.integrate(own, w, state, times[1], True, *unsampled, max_steps)
-                ends[k], evaluations[k] = state.y, state.count[EVALUATIONS]
-
-        return work
-
-    return _share(begin, starts, before, threads)
 
 
 def _share(

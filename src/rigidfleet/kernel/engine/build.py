@@ -7,6 +7,7 @@ In a process of its own (`objects.build_command`) it writes the code to standard
 shares little with the integrator meanwhile.
 """
 
+# ruff: noqa: PLW0108 -- functions are called, not entered themselves: how the compiler fuses products depends on it
 import re
 import subprocess
 import sys
@@ -28,7 +29,7 @@ from rigidfleet.kernel import (
 )
 from rigidfleet.kernel.avoidance import AvoidanceArrays
 from rigidfleet.kernel.compiler.jit import OPTIONS
-from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, set_extents
+from rigidfleet.kernel.compiler.pointers import Pointer, keep_extents, pointer, set_extents
 from rigidfleet.kernel.engine import objects, packing
 from rigidfleet.kernel.measured import Measured
 from rigidfleet.kernel.problem import Problem, Workspace
@@ -63,110 +64,67 @@ def flight_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]:
     Their arguments are addresses of named tuples. They integrate (and return what `dopri5.integrate` returns),
     record, and monitor. The ``second`` process, if there is one, makes what is `monitor_code`.
     """
-    problem, workspace, integrator, segment, record = map(
-        _pointer, (Problem, Workspace, IntegratorState, Segment, Record)
-    )
 
-    def integrate_segment(p, w, state, s):
-        call = segment(s)
+    def integrate_segment(p, w, state, call):
         return dopri5.integrate(
-            problem(p), workspace(w), integrator(state), call.t_end, call.fresh, call.times, call.samples,
-            call.max_steps,
-        )  # fmt: skip
-
-    def record_segment(p, w, s, out):
-        call = segment(s)
-        recorder.record(
-            call.times, call.samples, problem(p), workspace(w), call.dy, record(out), call.first
+            p, w, state, call.t_end, call.fresh, call.times, call.samples, call.max_steps
         )
+
+    def record_segment(p, w, call, out):
+        recorder.record(call.times, call.samples, p, w, call.dy, out, call.first)
         return 0
 
     keep_extents()
-    entries = objects.ENTRIES["flight"]
-    functions = zip((integrate_segment, record_segment), entries.items(), strict=False)
-    modules = [_module(function, *entry) for function, entry in functions]
-    text, symbol, _ = modules[0]
-    codes = [_object_code(*module) for module in modules]
-    three = _object_code(text, symbol, "integrate_three", sizes=THREE)
+    integrated, recorded = (IntegratorState, Segment), (Segment, Record)
+    integration = _module(integrate_segment, Problem, Workspace, *integrated, result=types.int64)
+    recording = _module(record_segment, Problem, Workspace, *recorded, result=types.int64)
+    codes = [
+        _object_code(*integration, "integrate"),
+        _object_code(*integration, "integrate_three", sizes=THREE),
+        _object_code(*recording, "record"),
+    ]
     made = None if second is None else objects.split_objects(second.communicate()[0])
-    return [*codes, *(made or monitor_code()), three]
+    return [*codes, *(made or monitor_code())]
 
 
 def monitor_code() -> list[bytes]:
     """Object codes of monitor, measurement, clearances and recursions, which share little with the rest."""
-    problem, workspace, integrator, watching = map(
-        _pointer, (Problem, Workspace, IntegratorState, Monitor)
-    )
-
-    def bound_moves(p, state, watch):
-        monitor.bound_changes(problem(p), integrator(state), watching(watch))
-        return 0
-
-    def watch_distances(first, end, p, state, watch):
-        monitor.watch_distances(first, end, problem(p), integrator(state), watching(watch))
-        return 0
-
-    def watch_forces(last, p, w, state, watch):
-        monitor.watch_forces(last, problem(p), workspace(w), integrator(state), watching(watch))
-        return 0
-
-    def caller(function, of):
-        def call(address):
-            function(of(address))
-            return 0
-
-        return call
-
-    functions = (
-        bound_moves,
-        watch_distances,
-        watch_forces,
-        caller(measurement.measure, _pointer(Measured)),
-        caller(recursion.recurse, _pointer(Recursion)),
-    )
-    entries = list(objects.ENTRIES["flight"].items())[2:-1]
-    return [
-        _object_code(*_module(function, name, words))
-        for function, (name, words) in zip(functions, entries, strict=True)
-    ]
+    watched, word = (Problem, IntegratorState, Monitor), types.int64
+    with_law = Problem, Workspace, IntegratorState, Monitor
+    calls = (
+        ("bound_moves", lambda p, s, m: monitor.bound_changes(p, s, m), *watched),
+        ("watch_distances", lambda i, j, p, s, m: monitor.watch_distances(i, j, p, s, m), word, word, *watched),
+        ("watch_forces", lambda last, p, w, s, m: monitor.watch_forces(last, p, w, s, m), word, *with_law),
+        ("measure", lambda m: measurement.measure(m), Measured),
+        ("follow", lambda s: recursion.recurse(s), Recursion),
+    )  # fmt: skip
+    return [_object_code(*_module(*call), name) for name, *call in calls]
 
 
 def sampled_code() -> list[bytes]:
-    """Object code of the two C functions of sampled flights."""
-    from rigidfleet.kernel import quadrotor, sampled_flight
+    """Object code of sampled flights."""
+    from rigidfleet.kernel import sampled_flight
 
-    problem, workspace, flight, state = map(
-        _pointer, (Problem, Workspace, fleet.SampledFlight, fleet.SampledState)
-    )
-    segment, evaluation = map(_pointer, (fleet.SampledSegment, fleet.Evaluation))
+    def fly(p, w, flight, state, call):
+        return sampled_flight.fly_ticks(p, w, flight, state, call)
 
-    def fly(p, w, f, s, call):
-        return sampled_flight.fly_ticks(
-            problem(p), workspace(w), flight(f), state(s), segment(call)
-        )
-
-    def evaluate(f, call):
-        return quadrotor.evaluate(flight(f), evaluation(call))
-
-    functions = zip((fly, evaluate), objects.ENTRIES["sampled"].items(), strict=True)
-    modules = [_module(function, *entry) for function, entry in functions]
-    return [_object_code(*module, hot=_HOT_SAMPLED) for module in modules]
+    kinds = Problem, Workspace, fleet.SampledFlight, fleet.SampledState, fleet.SampledSegment
+    module = _module(fly, *kinds, result=types.int64)
+    return [_object_code(*module, "fly_ticks", hot=_HOT_SAMPLED)]
 
 
 def avoidance_code() -> list[bytes]:
     """Object code of avoidance in flight."""
     from rigidfleet.kernel import guard
 
-    problem, workspace, flight, state = map(
-        _pointer, (Problem, Workspace, fleet.SampledFlight, fleet.SampledState)
-    )
-    avoidance = _pointer(AvoidanceArrays)
+    problem, workspace = (pointer(_type_of(kind)) for kind in (Problem, Workspace))
 
-    def avoid(f, s, address, _):
-        a = avoidance(address)
-        return guard.guard_forces(problem(a.law[0]), workspace(a.law[1]), flight(f), state(s), a)
+    def avoid(f, s, a, _):
+        return guard.guard_forces(problem(a.law[0]), workspace(a.law[1]), f, s, a)
 
-    return [_object_code(*_module(avoid, "avoid", objects.ENTRIES["avoidance"]["avoid"]), hot=())]
+    word = types.int64
+    kinds = fleet.SampledFlight, fleet.SampledState, AvoidanceArrays, word
+    return [_object_code(*_module(avoid, *kinds, result=word), "avoid", hot=())]
 
 
 def solids_code() -> list[bytes]:
@@ -174,19 +132,14 @@ def solids_code() -> list[bytes]:
     from rigidfleet.kernel.obstacles import watch_step
 
     row_of = monitor.row_of
-    problem, integrator, watching, solids = map(
-        _pointer, (Problem, IntegratorState, Monitor, Solids)
-    )
 
     def watch_solids(first, end, p, state, watch, s):
-        at, trail = integrator(state), integrator(state).trail
         for step in range(first, end):
-            row = row_of(step, at)
-            start, length = trail.clock[row, 0], trail.clock[row, 1]
-            watch_step(trail.points[row], start, length, problem(p), solids(s), watching(watch))
-        return 0
+            row, trail = row_of(step, state), state.trail
+            watch_step(trail.points[row], trail.clock[row, 0], trail.clock[row, 1], p, s, watch)
 
-    return [_object_code(*_module(watch_solids, "watch_solids", 6), hot=())]
+    kinds = types.int64, types.int64, Problem, IntegratorState, Monitor, Solids
+    return [_object_code(*_module(watch_solids, *kinds), "watch_solids", hot=())]
 
 
 def large_code() -> list[bytes]:
@@ -197,9 +150,10 @@ def large_code() -> list[bytes]:
         function = getattr(elimination, source, None) or getattr(block_cholesky, source)
         fields = ", ".join(f"x.{field}" for field in kind._fields)
         call = f"return 0.0 + f({fields})" if source in _RETURNING else f"f({fields}); return 0.0"
-        scope = {"at": _pointer(kind), "f": function}
-        exec(f"def entry(address):\n    x = at(address)\n    {call}", scope)
-        codes.append(_object_code(*_module(scope["entry"], name, 1, types.float64), hot=()))
+        scope = {"f": function}
+        exec(f"def entry(x):\n    {call}", scope)
+        module = _module(scope["entry"], kind, result=types.float64)
+        codes.append(_object_code(*module, name, hot=()))
     return codes
 
 
@@ -213,17 +167,16 @@ LIBRARIES = {
 }
 
 
-def _pointer(kind: type) -> Any:
-    """The compiled function that converts an int64 to the address of a named tuple of this type."""
-    return pointer(typeof(packing.example_of(kind)))
+def _type_of(kind: type) -> Any:
+    """The type, for the compiler, of a type of named tuples."""
+    return typeof(packing.example_of(kind))
 
 
-def _module(
-    function: Any, name: str, arguments: int, result: Any = types.int64
-) -> tuple[str, str, str]:
-    """Input of `_object_code`: the module of a C function of so many addresses, its symbol, and its ``name``."""
-    made = cfunc(result(*(types.int64,) * arguments), **OPTIONS)(function)
-    return made.inspect_llvm(), made.native_name, name
+def _module(function: Any, *arguments: Any, result: Any = types.void) -> tuple[str, str]:
+    """The module of a C function of words and of addresses of named tuples of these types, and its symbol."""
+    kinds = [x if x is types.int64 else Pointer(_type_of(x)) for x in arguments]
+    made = cfunc(result(*kinds), **OPTIONS)(function)
+    return made.inspect_llvm(), made.native_name
 
 
 def _object_code(

@@ -88,24 +88,10 @@ def forget_stages(k, first):
 
 @jit_inline
 def _sum(k, q, w, first, end):
-    """Sum of w_j k[j, q] over stage 0 and the stages from ``first`` (1, 2 or 3) to before ``end``, literals."""
+    """Sum of w_j k[j, q] over stage 0 and the stages from ``first`` to before ``end``, literals."""
     total = w[0] * k[0, q]
-    if first < 2 and end > 1:
-        total += w[1] * k[1, q]
-    if first < 3 and end > 2:
-        total += w[2] * k[2, q]
-    if end > 3:
-        total += w[3] * k[3, q]
-    if end > 4:
-        total += w[4] * k[4, q]
-    if end > 5:
-        total += w[5] * k[5, q]
-    if end > 6:
-        total += w[6] * k[6, q]
-    if end > 7:
-        total += w[7] * k[7, q]
-    if end > 8:
-        total += w[8] * k[8, q]
+    for s in range(first, end):
+        total += w[s] * k[s, q]
     return total
 
 
@@ -194,12 +180,6 @@ def squared_errors(k, h, rtol, p):
     for q in range(2 * coordinates, k.shape[1]):
         squares += _squared_error(k, q, _sum(k, q, v, 3, STAGES), rtol)
     return squares
-
-
-@jit_inline
-def step_size(t, h, t_end, p):
-    """As `dopri5.step_size`; the tables of an `UnrolledProblem` are named as those of a `Disturbance`."""
-    return step_to_knot(t, h, t_end, p)
 
 
 @jit_inline
@@ -311,5 +291,6 @@ INSTEAD = {
     "keep_samples": keep_samples,
     "keep_start": keep_start,
     "squared_errors": squared_errors,
-    "step_size": step_size,
+    # The tables of an `UnrolledProblem` are named as those of a `Disturbance`.
+    "step_size": step_to_knot,
 }

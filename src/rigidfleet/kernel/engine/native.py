@@ -62,22 +62,8 @@ from rigidfleet.solids.records import Solids
 from rigidfleet.typing import Floats
 
 
-def integrate(
-    problem: Problem,
-    workspace: Workspace,
-    state: IntegratorState,
-    t_end: float,
-    fresh: bool,
-    times: Floats,
-    samples: Floats,
-    max_steps: int,
-) -> int:
-    """Integrate to ``t_end`` [s], see `rigidfleet.kernel.dopri5.integrate`."""
-    return Integration(problem, workspace, state, t_end, times, samples)(fresh, max_steps)
-
-
 class Integration:
-    """An integration to ``t_end`` [s] in parts: a callable that integrates at most some steps."""
+    """An integration to ``t_end`` [s] in parts: a callable that does some steps; see `rigidfleet.kernel.dopri5`."""
 
     def __init__(
         self,
@@ -97,7 +83,7 @@ class Integration:
         self._integrate = code.integrate_three if three else code.integrate
 
     def __call__(self, fresh: bool, max_steps: int) -> int:
-        """Go on; ``fresh`` as in `Segment`. Returns what `rigidfleet.kernel.dopri5.integrate` returns."""
+        """Do at most so many steps; ``fresh`` as in `Segment`. Returns what `dopri5.integrate` returns."""
         self._segment.words[1], self._segment.words[2] = int(fresh), max_steps
         return self._integrate(*self._addresses)
 

@@ -28,7 +28,7 @@ ENTRIES = {
         "follow": 1,
         "integrate_three": 4,  # the first, for three agents with three edges
     },
-    "sampled": {"fly_ticks": 5, "evaluate": 2},
+    "sampled": {"fly_ticks": 5},
     "avoidance": {"avoid": 4},  # flight, state, avoidance, 0
     "solids": {"watch_solids": 6},  # first, end, problem, integrator, monitor, solids
     "large": dict.fromkeys(

@@ -165,7 +165,6 @@ def examples() -> tuple[
     fleet.SampledFlight,
     fleet.SampledState,
     fleet.SampledSegment,
-    fleet.Evaluation,
     AvoidanceArrays,
     Measured,
     Recursion,
@@ -195,10 +194,10 @@ def examples() -> tuple[
     vehicles = fleet.quadrotors([fleet.VehicleDynamics(1.0, point=True)])
     flight = fleet.ideal_flight(vehicles, start=0.0, h=0.0, steps=1)
     S = np.zeros((1, fleet.STATES))
-    rotors, rows = np.zeros((1, 4)), np.zeros((0, 1, 3))
+    rows = np.zeros((0, 1, 3))
     return (
         problem, work, state, segment, UNRECORDED, watching, flight, fleet.initial_state(flight, S, work),
-        fleet.segment(1, 0, 0.0), fleet.Evaluation(S, rotors, places, places, frame, S),
+        fleet.segment(1, 0, 0.0),
         avoidance_arrays(period=1.0, b=one, lift=one, mass=one, g=0.0, radius=one),
         measurement_of(1, 0, 0, time=none, start=np.zeros(1, dtype=np.int64), attached=np.zeros(0, dtype=np.bool_),
                  framed=False, mass=one, lost_at=one, limit=one, edges=np.zeros((0, 2), dtype=np.int64),

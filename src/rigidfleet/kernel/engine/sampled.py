@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from rigidfleet.kernel.avoidance import AvoidanceArrays
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.packing import UNRECORDED, Packed, pack, pack_anew
-from rigidfleet.kernel.fleet import ENDLESS, Evaluation, SampledFlight, SampledSegment, SampledState
+from rigidfleet.kernel.fleet import ENDLESS, SampledFlight, SampledSegment, SampledState
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.kernel.records import Segment
-from rigidfleet.typing import Floats
 
 
 def fly_ticks(
@@ -91,25 +88,3 @@ def _check_sizes(flight: SampledFlight, state: SampledState, workspace: Workspac
             "the state is of another flight or problem: begin a flight by `fleet.initial_state`, and a phase by"
             " `fleet.state_under_problem`"
         )
-
-
-def derivatives(
-    flight: SampledFlight,
-    S: Floats,
-    command: Floats,
-    air: Floats | None = None,
-    push: Floats | None = None,
-) -> Floats:
-    """Derivatives (N, 17) of states ``S`` (N, 17), see `rigidfleet.kernel.quadrotor.derivative`.
-
-    For commands (N, 4) [rad/s], velocities of the air (N, 3) [m/s] and further forces (N, 3) [N], both zero by default.
-    """
-    none = np.zeros((len(S), 3))
-    out = np.empty_like(S)
-    call = pack_anew(
-        Evaluation(
-            S, command, none if air is None else air, none if push is None else push, np.eye(3), out
-        )
-    )
-    native.library("sampled").evaluate(pack(flight).address, call.address)
-    return out

@@ -79,9 +79,6 @@ class Symbol:
     def __neg__(self) -> Any:
         return self.trace.subtract(0.0, self)
 
-    def __abs__(self) -> Any:
-        return self.trace.symbol("abs", self)
-
     def __gt__(self, other: Any) -> bool:
         """Whether it is positive: known for the problem's numbers, assumed for other symbols."""
         if other != 0.0:
@@ -385,20 +382,13 @@ def _number_places(problem: Problem) -> Iterator[tuple[str, int, Any]]:
         index += np.size(x)
 
 
-#: Places of the numbers that may be zero, by the numbers of agents and edges.
-_PLACES: dict[tuple[int, int], dict[str, slice]] = {}
-
-
 def _is_nonzero(problem: Problem, values: Floats) -> dict[str, bool]:
     """Whether numbers that may be zero are not zero in all of eight problems."""
-    size = len(problem.vehicles.m), len(problem.graph.edges)
-    if size not in _PLACES:
-        _PLACES[size] = {
-            name: slice(index, index + np.size(x))
-            for name, index, x in _number_places(problem)
-            if name in _MAY_BE_ZERO
-        }
-    return {name: bool(values[place].any()) for name, place in _PLACES[size].items()}
+    return {
+        name: bool(values[index : index + np.size(x)].any())
+        for name, index, x in _number_places(problem)
+        if name in _MAY_BE_ZERO
+    }
 
 
 def flight_structure(problem: Problem, values: Floats, moves: Sequence[bool]) -> bytes:
@@ -409,23 +399,16 @@ def flight_structure(problem: Problem, values: Floats, moves: Sequence[bool]) ->
     UnfitError
         Some of the problems damp deformations, others do not, which is a branch of the law.
     """
-    graph, law, control, disturbance = (
-        problem.graph,
-        problem.law,
-        problem.control,
-        problem.disturbance,
-    )
+    graph, law, disturbance = problem.graph, problem.law, problem.disturbance
     damps = values[_NUMBERS.index("law.k_def")].astype(bool)
     if damps.any() and not damps.all():
         raise UnfitError("problems that take different branches")
     there = [*_is_nonzero(problem, values).values(), *moves]
-    kinds = law.solver, law.iterations, problem.reference.kind, control.kind, disturbance.active
+    kinds = law.solver, law.iterations, problem.reference.kind, problem.control.kind
     tables = [len(x) > 0 for x in (disturbance.gust, disturbance.noise_r, disturbance.noise_v)]
     pairs = graph.edges.tobytes(), graph.pairs.tobytes()
-    saturates = bool(problem.vehicles.saturate)
-    return repr(
-        ("flight", len(problem.vehicles.m), pairs, kinds, tables, saturates, there)
-    ).encode()
+    flags = disturbance.active, bool(problem.vehicles.saturate)
+    return repr(("flight", len(problem.vehicles.m), pairs, kinds, tables, flags, there)).encode()
 
 
 class Code:

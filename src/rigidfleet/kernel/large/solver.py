@@ -168,7 +168,9 @@ class LargeSolver:
         w, edges, m = self.workspace, self.edges, self.vehicles.m
         if self.pattern is None:
             self._prepare()
-        self._find_rotation()
+        # The rotation of the formation since the factor was made.
+        self.now = _axes(self.workspace.r[self.marks])
+        self.turned = np.eye(3) if self.axes is None else self.now.T @ self.axes
         self.rest[:] = w.b
         y, a = w.multiplier, self.a
         y[:], a[:] = 0.0, 0.0
@@ -257,11 +259,6 @@ class LargeSolver:
         self.counts.iterations += min(int(taken), most)
         return int(taken)
 
-    def _find_rotation(self) -> None:
-        """Find the rotation of the formation since the factor was made."""
-        self.now = _axes(*self.workspace.r[self.marks].tolist())
-        self.turned = np.eye(3) if self.axes is None else self.now.T @ self.axes
-
     def _renew_factor(self) -> None:
         """Factor K at the current shape, with more damping if a factor without fill needs it."""
         w, p, m = self.workspace, self.pattern, self.vehicles.m
@@ -299,17 +296,12 @@ def _far_apart(r: Floats) -> Ints:
     return np.array([i, j, k])
 
 
-def _axes(a: list[float], b: list[float], c: list[float]) -> Floats:
-    """Rows of a rotation (3, 3) attached to three points; the identity if they are on a line."""
-    x = [q - p for p, q in zip(a, b, strict=True)]
-    z = _cross(x, [q - p for p, q in zip(a, c, strict=True)])
+def _axes(r: Floats) -> Floats:
+    """Rows of a rotation (3, 3) attached to three points r (3, 3); the identity if they are on a line."""
+    x = r[1] - r[0]
+    z = np.cross(x, r[2] - r[0])
     size, area = math.hypot(*x), math.hypot(*z)
     if not area > 1e-9 * size * size:
         return np.eye(3)
-    x, z = [q / size for q in x], [q / area for q in z]
-    return np.array([x, _cross(z, x), z])
-
-
-def _cross(a: list[float], b: list[float]) -> list[float]:
-    """a x b, in a twentieth of the time that NumPy takes for three numbers."""
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    x, z = x / size, z / area
+    return np.array([x, np.cross(z, x), z])
