@@ -81,8 +81,8 @@ def _first_check(mission: Mission, name: str, held: _Held, *, skipped: bool) -> 
     spacing = math.inf if slots is None or len(slots) < 2 else float(nearest(slots).min())
     return FormationCheck(
         name, None, held,
-        method=solvers.choose_method(mission.n_agents, edges, mission.constraint.solver), skipped=skipped,
-        spacing=spacing, colours=len({*(mission.formation_colours(name) or ())}),
+        solve=solvers.choose_method(mission.n_agents, edges, mission.constraint.solver), skipped=skipped,
+        spacing_m=spacing, colours=len({*(mission.formation_colours(name) or ())}),
     )  # fmt: skip
 
 

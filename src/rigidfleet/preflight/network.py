@@ -279,15 +279,15 @@ def network_remarks(preflight: Preflight) -> Iterator[Remark]:
             text = f"'{name}': not checked over its network: it has no slots, no edge in range, or too many edges"
             yield Remark("note", "network", text)
     for name, f in preflight.network.items():
-        if f.unheard:
-            text = f"'{name}': {f.unheard} edges are longer than the range of the network: nobody hears along them"
+        if f.unheard_edges:
+            text = f"'{name}': {f.unheard_edges} edges are longer than the range of the network: nobody hears along them"
             yield Remark("note", "network", text)
         if f.bears_network:
             continue
         share, what = f.growing or 0.0, f"{100 * f.own_loss:.0f} % of its messages are lost"
         why, remedy = what, "lower network.loss, raise network.rate, or slow the constraint law"
-        if f.own_delay > f.delay:
-            why = f"its messages are up to {f.own_delay} ticks late, and it bears {f.delay}"
+        if f.own_delay_ticks > f.delay_ticks:
+            why = f"its messages are up to {f.own_delay_ticks} ticks late, and it bears {f.delay_ticks}"
             remedy = "shorten network.delay, or slow the constraint law"
         grows = f"errors grow in {100 * share:.0f} % of linear flights"
         text = f"'{name}': unstable over its network: {why}; {grows}; {remedy}"
