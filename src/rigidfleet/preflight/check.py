@@ -30,9 +30,10 @@ from rigidfleet.preflight.trajectory import (
     disturbance_remarks,
     downwash_remarks,
     greatest_speed,
+    greatest_thrust,
     limit_remarks,
     separation_remarks,
-    thrust_remarks,
+    step_remarks,
     waypoint_remarks,
 )
 from rigidfleet.preflight.vehicles import check_vehicles, vehicle_remarks
@@ -68,6 +69,7 @@ def check(
     preflight = Preflight(mission, formations, check_gains(mission, formations), planned)
     preflight.speed = greatest_speed(planned, slice(3))
     preflight.vertical_speed = greatest_speed(planned, slice(2, 3))
+    preflight.thrust = greatest_thrust(mission, planned)
     if not known:
         preflight.judged_to = float(planned[-1].time[-1]) if planned else 0.0
     if lags := vehicle_lags(mission):
@@ -86,7 +88,7 @@ def check(
         *separation_remarks(mission, preflight),
         *downwash_remarks(mission, preflight),
         *assignment_remarks(mission, preflight),
-        *thrust_remarks(mission, preflight),
+        *step_remarks(mission, preflight),
         *vehicle_remarks(mission, preflight),
         *braking_remarks(mission),
         *disturbance_remarks(mission, preflight),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -140,8 +140,7 @@ class GainsCheck:
         return table_of([row], ("in",))
 
 
-@dataclass(frozen=True)
-class FormationMargins:
+class FormationMargins(NamedTuple):
     """Margins of all loops of a formation, or of a way between two: the smallest over its shapes and attitudes.
 
     Attributes
@@ -215,9 +214,9 @@ class FormationNetwork:
     @property
     def bears_network(self) -> bool:
         """Whether the mission's own network is within what the formation bears."""
-        if self.loss is None or self.own_loss > self.loss or self.own_delay_ticks > self.delay_ticks:
-            return False
-        return (self.growing or 0.0) <= 0.5
+        share = -1.0 if self.loss is None else self.loss
+        within = self.own_loss <= share and self.own_delay_ticks <= self.delay_ticks
+        return within and (self.growing or 0.0) <= 0.5
 
     def weaker_of(self, other: FormationNetwork) -> FormationNetwork:
         """The one of both that bears less."""
@@ -229,7 +228,8 @@ class FormationNetwork:
         ms, bears = 1e3 * self.tick_s, None if self.loss is None else 100 * self.loss
         return {
             "broadcasts [/s]": self.broadcasts_hz, "bears delay [ms]": ms * self.delay_ticks,
-            "has [ms]": ms * self.own_delay_ticks, "bears loss [%]": bears, "has [%]": None if bears is None else 100 * self.own_loss,
+            "has [ms]": ms * self.own_delay_ticks, "bears loss [%]": bears,
+            "has [%]": None if bears is None else 100 * self.own_loss,
             "flights that grow [%]": None if self.growing is None else 100 * self.growing,
         }  # fmt: skip
 
@@ -299,7 +299,7 @@ class VehicleCheck:
 
     rotor_force: tuple[float, float, str, float, str]
     tilt: tuple[float, float, str, str]
-    jump: tuple[float, float, float, str] | None
+    jump: tuple[float, float, float, str] | None = None
     beyond: tuple[float, str, str, str] | None = None
 
     def data(self) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def gain_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
             "note", "gains", "errors oscillate for more than a thousand cycles: raise alpha"
         )
     elif g.settling_time_s > max(b - a for a, b in phase_spans(mission)):
-        text = f"errors of distances need {g.settling_time_s:.3g} s to settle, longer than any phase"
+        text = f"errors of edges need {g.settling_time_s:.3g} s to settle, longer than any phase"
         yield Remark("note", "gains", text)
 
 

@@ -279,8 +279,8 @@ def network_remarks(preflight: Preflight) -> Iterator[Remark]:
             text = f"'{name}': not checked over its network: it has no slots, no edge in range, or too many edges"
             yield Remark("note", "network", text)
     for name, f in preflight.network.items():
-        if f.unheard_edges:
-            text = f"'{name}': {f.unheard_edges} edges are longer than the range of the network: nobody hears along them"
+        if far := f.unheard_edges:
+            text = f"'{name}': {far} edges are longer than the range of the network: nobody hears along them"
             yield Remark("note", "network", text)
         if f.bears_network:
             continue

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigidfleet._common.quantities import MOTIONS
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.formation import distance_geometry
@@ -138,33 +137,29 @@ def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             yield Remark("fails" if exact else "note", "downwash", text)
 
 
-def thrust_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
-    """Remarks on planned thrust beyond a limit."""
-    masses, limits = mission.fleet.mass, mission.fleet.thrust_limit
-    weight, way = np.array([0.0, 0.0, mission.gravity]), preflight.planned_phases
-    if way:
-        needs = [masses * np.linalg.norm(planned.acceleration + weight, axis=2) for planned in way]
-        preflight.thrust, planned = _nearest_to_limit(way, needs, limits)
-        force, t, who, limit = preflight.thrust
-        smooth = mission.smooth and planned.exact  # judged with the other limits of the plan
-        if force > limit * (1 + 1e-3) and not smooth:
-            text = f"{who} needs {force:.1f} N at {t:.2f} s in '{planned.phase}'"
-            text += f" (limit {limit:g} N)"
-            yield Remark("fails" if planned.exact else "note", "thrust", text)
-    yield from _step_thrust(mission, preflight)
-
-
 def _nearest_to_limit(
     way: list[PlannedPhase], needs: list[Floats], limits: Floats
-) -> tuple[tuple[float, float, str, float], PlannedPhase]:
+) -> tuple[float, float, str, float]:
     """Of the forces (K, N) [N] of each phase, the one nearest to its limit (N,) [N], or the greatest if there is none.
 
-    Its value, time [s], agent and limit, and its phase.
+    Its value, time [s], agent and limit.
     """
     room = limits if np.isfinite(limits).any() else 0.0
     planned, need = max(zip(way, needs, strict=True), key=lambda pair: (pair[1] - room).max())
     k, i = np.unravel_index(int((need - room).argmax()), need.shape)
-    return (float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])), planned
+    return float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])
+
+
+def greatest_thrust(
+    mission: Mission, way: list[PlannedPhase]
+) -> tuple[float, float, str, float] | None:
+    """The planned thrust [N] that is nearest to its limit, its time [s], agent and limit [N]; None without a plan."""
+    if not way:
+        return None
+    weight = np.array([0.0, 0.0, mission.gravity])
+    needs = [np.linalg.norm(planned.acceleration + weight, axis=2) for planned in way]
+    needs = [mission.fleet.mass * need for need in needs]
+    return _nearest_to_limit(way, needs, mission.fleet.thrust_limit)
 
 
 def greatest_speed(way: list[PlannedPhase], axes: slice) -> tuple[float, float, str] | None:
@@ -172,8 +167,7 @@ def greatest_speed(way: list[PlannedPhase], axes: slice) -> tuple[float, float, 
     if not way:
         return None
     sizes = [np.linalg.norm(planned.velocity[..., axes], axis=2) for planned in way]
-    (speed, t, who, _), _ = _nearest_to_limit(way, sizes, np.full(sizes[0].shape[1], np.inf))
-    return speed, t, who
+    return _nearest_to_limit(way, sizes, np.full(sizes[0].shape[1], np.inf))[:3]
 
 
 def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -195,7 +189,7 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
         force = true[:, None] * (planned.acceleration + g * up)
         force -= drag[:, None] * (wind - planned.velocity)
         needs.append(np.linalg.norm(force, axis=2) + gusts + noise)
-    most, _ = _nearest_to_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
+    most = _nearest_to_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
     steady = air_force(mission, np.tile(wind, (len(drag), 1)))
     steady -= ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
@@ -210,23 +204,12 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
     if most[0] > most[3]:
         text = f"with disturbances, {most[2]} may need {most[0]:.1f} N at {most[1]:.2f} s (limit {most[3]:g} N)"
         yield Remark("note", "thrust", text)
-    if off[far] > WAYPOINT_TOLERANCE["position"] and any(
-        phase.control == "tracking" for phase in mission.phases
-    ):
-        text = (
-            f"steady disturbances hold agent {far + 1} {off[far]:.2f} m off its slot, because tracking has no integral;"
-            f" a larger first weight in tracking.Q reduces the offset (now {mission.tracking.Q[0]:g})"
-            + ("" if mission.vehicle_models is None else ", and tracking.integral removes it")
-        )
-        yield Remark("note", "disturbances", text)
     if lost:
-        text = (
-            f"paths are checked as if {agent_names(tuple(i for i, _ in lost))} flew on to the end"
-        )
+        text = f"paths are checked as if {agent_names(i for i, _ in lost)} flew on to the end"
         yield Remark("note", "disturbances", text)
 
 
-def _step_thrust(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
+def step_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on the forces at a step of the reference: J M^-1 J^T lambda = -beta^2 c."""
     c, masses = mission.constraint, mission.fleet.mass
     if c.stabilisation == "none":
@@ -241,9 +224,8 @@ def _step_thrust(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         edges = mission.formation_edges(shaping.formation)
         if min(len(edges), 3 * mission.n_agents) > DENSE:
             continue
-        error = distance_geometry.distances(r, edges) - mission.formation_distances(
-            shaping.formation
-        )
+        lengths = mission.formation_distances(shaping.formation)
+        error = distance_geometry.distances(r, edges) - lengths
         J = jacobian(r, edges)
         root = np.repeat(1 / np.sqrt(masses), 3)
         f = np.linalg.lstsq(J * root, -(c.beta**2) * error, rcond=1e-7)[0] / root
@@ -346,16 +328,16 @@ def _limits_of_reference(
 
 
 def _limits_at_samples(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
-    """Remarks on speed and acceleration of samples beyond their limits."""
+    """Remarks on speed, acceleration and thrust of samples beyond their limits."""
     x = np.stack([planned.position, planned.velocity, planned.acceleration], axis=1)
     for limit in limits_of(mission):
-        q, most = limit.of, float(limit.most[0])
-        if q not in MOTIONS or q.order > 2:
+        q = limit.of
+        if q.order > 2 or q.name == "tilt":
             continue
         size = limit.values(x, np.arange(mission.n_agents))
         of = f" of {q.name_in_words}" if q.way else ""
-        k, i = np.unravel_index(int(size.argmax()), size.shape)
-        if size[k, i] > most * (1 + 1e-3):
+        k, i = np.unravel_index(int((size / limit.most).argmax()), size.shape)
+        if size[k, i] > (most := limit.most[i]) * (1 + 1e-3):
             text = (
                 f"agent {i + 1} reaches {size[k, i]:.3g} {q.unit}{of} at {planned.time[k]:.2f} s in"
                 f" '{planned.phase}' (limit {most:g} {q.unit})"
