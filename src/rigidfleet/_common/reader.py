@@ -10,9 +10,11 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 import reprlib
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass
+from inspect import signature
 from types import NoneType, UnionType
 from typing import (
     TYPE_CHECKING,
@@ -121,11 +123,8 @@ def as_type(value: Any, kind: Any, where: str) -> Any:
         hints = get_type_hints(kind, include_extras=True)
         needed = getattr(kind, "__required_keys__", None)
         if needed is None:  # a dataclass
-            needed = {
-                f.name
-                for f in fields(kind)
-                if f.default is MISSING and f.default_factory is MISSING
-            }
+            parameters = signature(kind).parameters.values()
+            needed = {x.name for x in parameters if x.default is x.empty}
         known = hints.keys() - {"__others__"}
         if needed <= value.keys() and ("__others__" in hints or value.keys() <= known):
             made = {
@@ -133,7 +132,7 @@ def as_type(value: Any, kind: Any, where: str) -> Any:
                 for key, item in value.items()
             }
             return kind(**made)
-    raise DamagedError(f"{where} has an invalid value: {_short(value)}")
+    raise DamagedError(f"{where} has an invalid value: {reprlib.repr(value)[:60]}")
 
 
 #: Maximum magnitude of a number.
@@ -141,16 +140,7 @@ _HUGE = 1e300
 
 
 def _is_text(value: str) -> bool:
-    try:
-        value.encode()
-    except UnicodeEncodeError:  # a lone surrogate
-        return False
-    return True
-
-
-def _short(value: Any) -> str:
-    text = reprlib.repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return re.search("[\ud800-\udfff]", value) is None  # a lone surrogate
 
 
 def read_arrays(

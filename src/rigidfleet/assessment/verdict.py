@@ -115,15 +115,11 @@ class Verdict(Shown):
     @property
     def worst(self) -> dict[str, Extreme]:
         """Extremes of the whole flight, named as in `PhaseVerdict.worst`."""
-        by_name: dict[str, list[Extreme]] = {}
-        for phase in self.phases:
-            for name, e in phase.worst.items():
-                by_name.setdefault(name, []).append(e)
-        return {
-            name: max(by_name[name], key=lambda e: q.rank(e.value))
-            for name, q in QUANTITIES.items()
-            if name in by_name
-        }
+        worst: dict[str, Extreme] = {}
+        for name, q in QUANTITIES.items():
+            if every := [phase.worst[name] for phase in self.phases if name in phase.worst]:
+                worst[name] = max(every, key=lambda e, q=q: q.rank(e.value))
+        return worst
 
     @property
     def summary(self) -> str:
@@ -167,8 +163,8 @@ class Verdict(Shown):
                 "checks": [_plain_check(check) for check in self.checks],
                 "notes": self.notes,
                 "read": self.read,
-                "worst": {name: asdict(extreme) for name, extreme in self.worst.items()},
-                "phases": [asdict(phase) for phase in self.phases],
+                "worst": self.worst,
+                "phases": self.phases,
             }
             | ({} if self.doubt is None else {"verdict": self.word, "doubt": self.doubt})
         )

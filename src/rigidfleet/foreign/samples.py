@@ -34,9 +34,8 @@ def looks_measured(curves: Sequence[Piecewise], assumed: str) -> bool:
             continue
         square = (third**2).mean(axis=0)
         both = (third[1:] * third[:-1]).mean(axis=0)
-        if (
-            (square > 20.0 * _SHOWN**2) & (both < _OF_NOISE * square)
-        ).any():  # 20: that of white noise
+        # 20 is the factor of white noise.
+        if ((square > 20.0 * _SHOWN**2) & (both < _OF_NOISE * square)).any():
             return True
     return False
 

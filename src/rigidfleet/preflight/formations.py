@@ -62,8 +62,8 @@ def check_formations(
         work = _work_time(mission, name, search=search)
         skipped = k > 1 and work > left
         left -= 0.0 if skipped else work
-        check = _first_check(mission, name, held[name], skipped=skipped)
-        checks[name] = check if skipped else _check_rigidity(mission, check, search=search)
+        check = _check_formation(mission, name, held[name], search=search, skipped=skipped)
+        checks[name] = check
     return [checks[name] for name in mission.formations]
 
 
@@ -75,27 +75,26 @@ def _work_time(mission: Mission, name: str, *, search: bool) -> float:
     return 0.1 * search + 5e-10 * min(m, 3 * n) ** 2 * max(m, 3 * n) + 2e-3
 
 
-def _first_check(mission: Mission, name: str, held: _Held, *, skipped: bool) -> FormationCheck:
-    """What needs no decomposition: the method, the spacing of the slots, and the lights."""
+def _check_formation(
+    mission: Mission, name: str, held: _Held, *, search: bool, skipped: bool
+) -> FormationCheck:
+    """The rigidity, or the spectrum of a large formation, and other shapes if they are searched.
+
+    Of a formation that is ``skipped``, what needs no decomposition: the solve, the spacing of the slots, the lights.
+    """
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
     spacing = math.inf if slots is None or len(slots) < 2 else float(nearest(slots).min())
-    return FormationCheck(
+    check = FormationCheck(
         name, None, held,
         solve=solvers.choose_method(mission.n_agents, edges, mission.constraint.solver), skipped=skipped,
         spacing_m=spacing, colours=len({*(mission.formation_colours(name) or ())}),
     )  # fmt: skip
-
-
-def _check_rigidity(mission: Mission, check: FormationCheck, *, search: bool) -> FormationCheck:
-    """The check with the rigidity, or the spectrum of a large formation, and other shapes if they are searched."""
-    name = check.name
-    slots, edges = mission.formation_slots(name), mission.formation_edges(name)
-    if slots is None or not len(edges):
+    if skipped or slots is None or not len(edges):
         return check
     masses, space = mission.agents.mass, mission.formations[name].dimension or mission.dimension
     if min(len(edges), 3 * mission.n_agents) > DENSE:
         start = _dimension_spanned(mission.fleet.position, centred(mission.fleet.velocity))
-        if check.held_by == "distances" and max(start, _dimension_spanned(slots)) == 2:
+        if held == "distances" and max(start, _dimension_spanned(slots)) == 2:
             space = 2  # which they do not leave
         points = flatten(slots, space)[0]
         ends = spectrum(points, edges, masses) if len(slots) <= LANCZOS else None

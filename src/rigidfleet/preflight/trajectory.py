@@ -293,7 +293,16 @@ def limit_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     for planned in preflight.planned_phases:
         phase = planned.leg.phase
         if (mission.smooth or phase.follows_curves) and phase.control == "tracking":
-            yield from _limits_of_reference(mission, planned, hopeless)
+            # The limit that its reference breaks most, with the least time that keeps all.
+            over = timing.broken_limits(mission, planned.leg)
+            if over and (topic := over[0].limit.of.name_in_words) not in hopeless:
+                key, t = timing.least_time(mission, planned.leg)
+                if t is None:
+                    hopeless.add(topic)
+                    remedy = f"no {key} of this phase keeps all limits"
+                else:
+                    remedy = f"the least {key} of this phase is {math.ceil(100 * t) / 100:.2f} s"
+                yield Remark("fails", topic, f"{timing.reached_in_words(over[0], phase)}; {remedy}")
         else:
             yield from _limits_at_samples(mission, planned)
         yield from geofence_remarks(mission, planned)
@@ -309,22 +318,6 @@ def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark
             text = f"agent {i + 1} leaves the geofence by {out[k, i]:.2f} m"
             text += f" at {planned.time[k]:.2f} s in '{planned.phase}'"
             yield Remark("fails" if planned.exact else "note", "geofence", text)
-
-
-def _limits_of_reference(
-    mission: Mission, planned: PlannedPhase, hopeless: set[str]
-) -> Iterator[Remark]:
-    """Remark on the limit that the reference of a smooth phase breaks most, with the least time that keeps all."""
-    over = timing.broken_limits(mission, planned.leg)
-    if not over or (topic := over[0].limit.of.name_in_words) in hopeless:
-        return
-    key, least = timing.least_time(mission, planned.leg)
-    if least is None:
-        remedy = f"no {key} of this phase keeps all limits"
-        hopeless.add(topic)
-    else:
-        remedy = f"the least {key} of this phase is {math.ceil(100 * least) / 100:.2f} s"
-    yield Remark("fails", topic, f"{timing.reached_in_words(over[0], planned.leg.phase)}; {remedy}")
 
 
 def _limits_at_samples(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
