@@ -159,13 +159,22 @@ def read_arrays(
     DamagedError
         An array is missing, has another type or shape, or the arrays are larger than a file of this size can be.
     """
+    import h5py
+
     datasets, known, numbers = {}, dict(sizes), 0
     for name, due in declared.items():
         if name not in file:
             if due.optional:
                 continue
             raise DamagedError(f"{name} is missing")
-        data = _dataset(file, name)
+        # Arrays are stored in this file: no link, no view of another file.
+        if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+            raise DamagedError(f"{name} is a link, not an array")
+        data = file[name]
+        if not isinstance(data, h5py.Dataset):
+            raise DamagedError(f"{name} is not an array")
+        if data.is_virtual or data.external:
+            raise DamagedError(f"{name} is stored in another file")
         kind = data.dtype.kind
         if kind not in ("iu" if due.whole else "f") or data.dtype.itemsize > 8:
             raise DamagedError(f"{name} has numbers of type {data.dtype}")
@@ -181,20 +190,6 @@ def read_arrays(
             raise DamagedError(f"{name} is larger than a file of {size:,} bytes can hold")
         datasets[name] = data
     return {name: data[...] for name, data in datasets.items()}
-
-
-def _dataset(file: h5py.File, name: str) -> h5py.Dataset:
-    """Return a dataset that is stored in this file: not a link, not a view of another file."""
-    import h5py
-
-    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-        raise DamagedError(f"{name} is a link, not an array")
-    data = file[name]
-    if not isinstance(data, h5py.Dataset):
-        raise DamagedError(f"{name} is not an array")
-    if data.is_virtual or data.external:
-        raise DamagedError(f"{name} is stored in another file")
-    return data
 
 
 def open_hdf5(data: bytes) -> h5py.File:

@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet._common.quantities import Quantity
 from rigidfleet.assessment.measure import Measurements
-from rigidfleet.assessment.outcome import CheckResult, Extreme, limit_check, value
+from rigidfleet.assessment.verdict import CheckResult, Extreme, limit_check, value
 from rigidfleet.result import Result
 
 #: Rate below which the clock counts as slowed: it comes back to 1 by an exponential.
@@ -42,8 +42,7 @@ def guarantee_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
 
 def avoidance_notes(measured: Measurements) -> Iterator[str]:
     """What the layers of avoidance did, and what the guarantee is worth."""
-    avoidance, result = measured.mission.avoidance, measured.result
-    if avoidance is None:
+    if (avoidance := measured.mission.avoidance) is None:
         return
     if not avoidance.guard:
         yield "[avoidance] without its guard guarantees nothing"
@@ -54,16 +53,7 @@ def avoidance_notes(measured: Measurements) -> Iterator[str]:
             if doubt
             else "the guarantee of [avoidance] is proved: at every tick, all vehicles could brake in time"
         )
-    yield from _body_notes(result)
-    for name, words in (("barrier", "barriers changed"), ("guard", "the guard replaced")):
-        every = [p.extremes[name] for p in result.phases if name in p.extremes]
-        if every:
-            most = max(every, key=lambda x: x.value)
-            first = min(x.time for x in every)
-            yield (
-                f"{words} what vehicles were asked for, first at {first:.2f} s, most of agent {most.who + 1}: at"
-                f" {100 * most.value:.2g} % of the ticks of a phase"
-            )
+    yield from _body_notes(measured.result)
 
 
 def clock_notes(result: Result) -> Iterator[str]:

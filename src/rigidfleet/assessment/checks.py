@@ -15,7 +15,7 @@ from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.assessment.avoidance import guarantee_check
 from rigidfleet.assessment.fits import is_rigid
 from rigidfleet.assessment.measure import Measurements
-from rigidfleet.assessment.outcome import (
+from rigidfleet.assessment.verdict import (
     FLIPPED,
     SLACK,
     TOUCH_DOWN,
@@ -180,10 +180,8 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
             rigid = is_rigid(measured.result.position[last][left], place[edges])
             state = "rigid, but" if rigid else "held by its edges, but"
             words = f"'{p.formation}' is {state} {wanted}: all {len(edges)} edges hold, yet {words}"
-        elif not passed:
-            words = f"'{p.formation}' is not reached: {words}"
         else:
-            words = f"'{p.formation}' is reached: {words}"
+            words = f"'{p.formation}' is {'' if passed else 'not '}reached: {words}"
         yield _check_at_end(p, "shape", passed, words, fit.error, fit.limit, "m", who=who)
         if fit.in_order is not None:
             words = f"the agents of '{p.formation}' are {'' if fit.in_order else 'not '}in order"

@@ -9,8 +9,7 @@ import numpy as np
 from rigidfleet._common.facts import Fact
 from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.assessment.measure import Measurements
-from rigidfleet.assessment.outcome import Extreme, limit_check
-from rigidfleet.assessment.verdict import Verdict
+from rigidfleet.assessment.verdict import Extreme, Verdict, limit_check
 from rigidfleet.result import Result
 
 

@@ -21,8 +21,7 @@ from rigidfleet._common.text import first_few
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign import logs, poses, shows, texts
 from rigidfleet.foreign.columns import Units, units_of
-from rigidfleet.foreign.curves import Trajectories
-from rigidfleet.foreign.samples import ASSUMED
+from rigidfleet.foreign.curves import ASSUMED, Trajectories
 from rigidfleet.math.piecewise import Piecewise
 
 __all__ = ["Gaps", "Interpolation", "Spans", "Trajectories", "read_trajectories"]

@@ -7,8 +7,14 @@ import numpy as np
 from rigidfleet._common.names import CRAZYFLIE
 from rigidfleet._common.tables import TextTable, fault
 from rigidfleet.foreign.columns import Units, are_row_numbers, parse_table, read_tracks
-from rigidfleet.foreign.curves import NAMES, Trajectories, curve_through_states, rows_to_curve
-from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
+from rigidfleet.foreign.curves import (
+    ASSUMED,
+    NAMES,
+    Trajectories,
+    curve_through_samples,
+    curve_through_states,
+    rows_to_curve,
+)
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.splines import POWERS
 

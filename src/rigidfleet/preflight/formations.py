@@ -102,7 +102,7 @@ def _check_formation(
     rigidity = analyse(slots, edges, masses=masses, dimension=space)
     check = replace(check, rigidity=rigidity)
     endless = rigidity.own.rigidity_class is RigidityClass.FLEXIBLE  # a continuum of other shapes
-    if not search or endless or worst_contradiction(mission, name) is not None:
+    if not search or endless or contradiction_in_words(mission, name):
         return check
     start, space = mission.agents.position, rigidity.own.space
     others = realisations(slots, edges, starts=STARTS, start=start, dimension=space)
@@ -120,16 +120,21 @@ def _held_by(mission: Mission, name: str) -> _Held:
     return "tracking" if controls == {"tracking"} else "distances"
 
 
-def worst_contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
-    """Edge whose given distance differs most from that of the slots, and this error [m]; None within tolerance."""
+def contradiction_in_words(mission: Mission, name: str) -> str:
+    """Whose given distance differs most from that of their slots, and by how much; "" within tolerance."""
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
     if slots is None or not len(edges):
-        return None
+        return ""
     lengths = mission.formation_distances(name)
     error = np.abs(distance_geometry.distances(slots, edges) - lengths)
     worst = int(error.argmax())
-    most = mission.formations[name].greatest_error(lengths.min())
-    return (worst, float(error[worst])) if error[worst] > most else None
+    if error[worst] <= mission.formations[name].greatest_error(lengths.min()):
+        return ""
+    i, j = edges[worst] + 1
+    return (
+        f"'{name}' will have another shape than its slots: agents {i} and {j} are given {lengths[worst]:.4g} m, which"
+        f" differs from that of their slots by {error[worst]:.3g} m"
+    )
 
 
 def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Iterator[Remark]:
@@ -151,13 +156,8 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         if f.held_by == "nothing":
             continue
         alone = f.held_by == "distances"
-        if (off := worst_contradiction(mission, f.name)) is not None:
-            i, j = mission.formation_edges(f.name)[off[0]] + 1
-            length = mission.formation_distances(f.name)[off[0]]
-            yield _fails(
-                f"'{f.name}' will have another shape than its slots: agents {i} and {j} are given {length:.4g} m,"
-                f" which differs from that of their slots by {off[1]:.3g} m"
-            )
+        if words := contradiction_in_words(mission, f.name):
+            yield _fails(words)
         r = f.rigidity
         if f.spectrum is not None:
             if f.spectrum.free:

@@ -161,10 +161,7 @@ def _gaps(mission: Mission, preflight: Preflight, radius: Floats) -> Iterator[Re
         cm = np.einsum("i,kia->ka", masses, planned.position) / masses.sum()
         between = (cm[:, None] > low) & (cm[:, None] < high)
         for axis in range(3):
-            rest = [k for k in range(3) if k != axis]
-            beside = between[:, :, rest].all(axis=2)
-            if not beside.any():
-                continue
+            beside = np.delete(between, axis, axis=2).all(axis=2)
             at = cm[:, axis, None]
             below = np.where(beside & (high[:, axis] < at), high[:, axis], -np.inf)
             above = np.where(beside & (low[:, axis] > at), low[:, axis], np.inf)
