@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 from rigidfleet._common.facts import (
@@ -336,7 +336,7 @@ class Verdict(Shown):
                     "waypoint": WAYPOINT_TOLERANCE,
                     "flip": FLIPPED,
                 },
-                "checks": [_plain_check(check) for check in self.checks],
+                "checks": self.checks,
                 "notes": self.notes,
                 "read": self.read,
                 "worst": self.worst,
@@ -378,14 +378,6 @@ class Verdict(Shown):
             Line(self.summary, _LEVELS[self.word]),
         ]
         return Sheet(self.mission, self.title, parts)
-
-
-def _plain_check(check: CheckResult) -> dict[str, Any]:
-    """A check as plain data; what belongs to doubt is there of what was measured alone."""
-    data = asdict(check)
-    if check.interval is None and not check.undecided:
-        del data["interval"], data["undecided"]
-    return data
 
 
 def _phase_table(phases: list[PhaseVerdict]) -> FactTable:

@@ -36,9 +36,8 @@ def read_text(data: bytes, stem: str, interpolation: str, units: Units) -> Traje
     if table.find("duration", "x^0"):
         for k, q in enumerate(table.kinds):
             labels = table.codes(k)[1] if q.kind in ("agent", "thing") else []
-            if len(labels) > 1 and (
-                q.kind == "agent" or not are_row_numbers(labels, len(table.lines))
-            ):
+            counts = q.kind == "thing" and are_row_numbers(labels, len(table.lines))
+            if len(labels) > 1 and not counts:
                 why = f"has polynomials of several vehicles in the column {table.names[k]!r}"
                 raise fault(why, "Give each vehicle a table")
         curve = _curve_of_coefficients(table)

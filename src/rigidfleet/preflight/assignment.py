@@ -42,15 +42,12 @@ def assignment_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         preflight.assignments[name] = Assignment(order, length, clearance)
     radius = mission.fleet.radius
     now, short, safe = preflight.assignments.values()
-    if short.path_length_m < (1 - _WORTH) * now.path_length_m - _SHORT:
-        text = (
-            f'assignment = "shortest" reduces the total path length from {now.path_length_m:.1f} m to'
-            f" {short.path_length_m:.1f} m"
-        )
+    before, after = now.path_length_m, short.path_length_m
+    if after < (1 - _WORTH) * before - _SHORT:
+        text = f'assignment = "shortest" reduces the total path length from {before:.1f} m to {after:.1f} m'
         yield Remark("note", "assignment", text)
-    if safe.min_clearance_m > now.min_clearance_m + 0.05 and now.min_clearance_m < 2 * radius.max():
-        text = (
-            f'assignment = "safe" increases the minimum clearance on the paths from {now.min_clearance_m:.2f} m to'
-            f" {safe.min_clearance_m:.2f} m"
-        )
+    before, after = now.min_clearance_m, safe.min_clearance_m
+    if after > before + 0.05 and before < 2 * radius.max():
+        what = "increases the minimum clearance on the paths"
+        text = f'assignment = "safe" {what} from {before:.2f} m to {after:.2f} m'
         yield Remark("note", "assignment", text)

@@ -277,9 +277,9 @@ class Disturbed:
         """Plain data for JSON."""
         return {
             **{f"{name}_n": getattr(self, name) for name in _FORCES},
-            "thrust": _by_name(("thrust_n", "time_s", "who", "limit_n"), self.thrust),
-            "offset": _by_name(("offset_m", "who"), self.offset),
-            "lost": [_by_name(("agent", "time_s"), (i + 1, t)) for i, t in self.lost],
+            "thrust": _by_name("thrust_n time_s who limit_n", self.thrust),
+            "offset": _by_name("offset_m who", self.offset),
+            "lost": [_by_name("agent time_s", (i + 1, t)) for i, t in self.lost],
         }
 
 
@@ -305,12 +305,10 @@ class VehicleCheck:
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
         return {
-            "rotor_force": _by_name(
-                ("force_n", "time_s", "who", "limit_n", "phase"), self.rotor_force
-            ),
-            "tilt": _by_name(("tilt_deg", "time_s", "who", "phase"), self.tilt),
-            "jump": _by_name(("acceleration_m_s2", "tilt_deg", "time_s", "phase"), self.jump),
-            "beyond": _by_name(("share", "who", "phase", "needs"), self.beyond),
+            "rotor_force": _by_name("force_n time_s who limit_n phase", self.rotor_force),
+            "tilt": _by_name("tilt_deg time_s who phase", self.tilt),
+            "jump": _by_name("acceleration_m_s2 tilt_deg time_s phase", self.jump),
+            "beyond": _by_name("share who phase needs", self.beyond),
         }
 
 
@@ -484,6 +482,7 @@ class Preflight(Shown):
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON, agents and slots counted from 1."""
+        proof = "phase separation_m time_s agents how"
         data = {
             "passed": self.passed,
             "remarks": self.remarks,
@@ -500,23 +499,17 @@ class Preflight(Shown):
                     planned.phase for planned in self.planned_phases if not planned.exact
                 ],
                 **{
-                    name: _by_name((key, "time_s", "who", "limit_n"), getattr(self, name))
+                    name: _by_name(f"{key} time_s who limit_n", getattr(self, name))
                     for name, (key, _) in _WORST.items()
                 },
                 "certificates": [
-                    _by_name(
-                        ("phase", "separation_m", "time_s", "agents", "how"),
-                        (phase, c.separation, c.time, np.add(c.agents, 1), c.how),
-                    )
-                    for phase, c in self.certificates.items()
+                    _by_name(proof, (phase, least, t, np.add(who, 1), how))
+                    for phase, (least, t, who, how) in self.certificates.items()
                 ],
                 "clearance": [
-                    _by_name(("obstacle", "clearance_m", "time_s", "who"), c)
-                    for c in self.clearance
+                    _by_name("obstacle clearance_m time_s who", c) for c in self.clearance
                 ],
-                "gaps": [
-                    _by_name(("between", "wide_m", "takes_m", "time_s"), g) for g in self.gaps
-                ],
+                "gaps": [_by_name("between wide_m takes_m time_s", g) for g in self.gaps],
                 "assignments": self.assignments,
             },
         }
@@ -603,5 +596,5 @@ def names_in_words(names: Sequence[str]) -> str:
     return f"{text} {'is' if len(names) == 1 else 'are'}"
 
 
-def _by_name(names: tuple[str, ...], values: tuple[Any, ...] | None) -> dict[str, Any] | None:
-    return None if values is None else dict(zip(names, values, strict=False))
+def _by_name(names: str, values: Sequence[Any] | None) -> dict[str, Any] | None:
+    return None if values is None else dict(zip(names.split(), values, strict=False))

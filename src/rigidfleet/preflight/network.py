@@ -60,8 +60,18 @@ def check_network(
     lags : of each vehicle
     """
     checks: dict[str, FormationNetwork] = {}
+    if (own := mission.network) is None:
+        return checks
+    net, every = network_of(mission), _ticks_per_law(mission)
     for name, flight, unheard in linear_flights(mission, way, lags):
-        check = _formation_network(mission, flight, unheard)
+        radio, latest = flight.radio, math.ceil((net.delay + net.jitter) / every)
+        delay, growing = last_stable_delay(flight), None
+        loss = greatest_stable_loss(flight) if radio.delay <= delay else None
+        if latest > min(radio.delay, delay) or own.burst is not None or own.loss > (loss or 0.0):
+            growing = float((sampled_growth(flight, net, every) > _GROWS).mean())
+        check = FormationNetwork(
+            flight.n / (radio.every * radio.tick), radio.tick, delay, latest, loss, own.loss, growing, unheard
+        )  # fmt: skip
         checks[name] = check.weaker_of(checks.get(name, check))
     return checks
 
@@ -89,19 +99,6 @@ def linear_flights(
         if 0 < 2 * near.sum() <= _LARGEST:
             flight = LinearFlight(slots, edges[near], mission.fleet.mass, law, radio, lags, drag)
             yield name, flight, int((~near).sum())
-
-
-def _formation_network(mission: Mission, flight: LinearFlight, unheard: int) -> FormationNetwork:
-    own, net, radio = mission.network, network_of(mission), flight.radio
-    assert own is not None
-    every = _ticks_per_law(mission)
-    latest, delay = math.ceil((net.delay + net.jitter) / every), last_stable_delay(flight)
-    loss = greatest_stable_loss(flight) if radio.delay <= delay else None
-    growing = None
-    if latest > min(radio.delay, delay) or own.burst is not None or own.loss > (loss or 0.0):
-        growing = float((sampled_growth(flight, net, every) > _GROWS).mean())
-    broadcasts = flight.n / (radio.every * radio.tick)
-    return FormationNetwork(broadcasts, radio.tick, delay, latest, loss, own.loss, growing, unheard)
 
 
 def _ticks_per_law(mission: Mission) -> int:

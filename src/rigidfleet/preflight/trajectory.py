@@ -29,6 +29,8 @@ from rigidfleet.typing import Floats
 
 #: Share by which a goal is planned to be missed by more than its tolerance, before it is said to be missed.
 _CLEARLY = 0.02
+#: Separation of two agents [m], when [s], and which, from 0.
+_Nearest = tuple[float, float, tuple[int, ...]]
 
 
 def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -37,10 +39,10 @@ def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         return
     radius, limit = mission.fleet.radius, mission.limits.separation or 0.0
     lowest = mission.limits.separation_altitude
-    worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
-    least = np.inf, 0.0, (0, 0)
+    worst: dict[bool, tuple[_Nearest, str]] = {}
+    least: _Nearest = np.inf, 0.0, (0, 0)
     for number, planned in enumerate(preflight.planned_phases):
-        ends: list[tuple[float, float, tuple[int, ...]]] = []
+        ends: list[_Nearest] = []
         positions = planned.position if planned.path_ends is None else np.array(planned.path_ends)
         # Where separation begins at an altitude, agents below it are left to the verdict.
         flying = positions[..., 2] >= (-np.inf if lowest is None else lowest)
@@ -57,23 +59,30 @@ def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
             least = min(least, crossing)
             beyond = flying.all() and (separation <= 0 or separation < limit - SLACK)
             if beyond and separation < min(ends)[0] - SLACK:
-                yield _crossing_remark(mission, planned, crossing, limit)
+                yield _crossing_remark(mission, planned, crossing)
         for k, at in enumerate(ends):
             least = min(least, at)
             # The start positions are known even if the path from there is not.
             exact = planned.exact or (number == 0 and k == 0 and planned.path_ends is not None)
-            if exact not in worst or at[0] < worst[exact][0]:
-                worst[exact] = *at, planned.phase
+            if exact not in worst or at[0] < worst[exact][0][0]:
+                worst[exact] = at, planned.phase
     if np.isfinite(least[0]):
         preflight.separation = least[0], least[1], agent_names(least[2])
-    for exact, (separation, t, who, phase) in worst.items():
-        if separation <= 0 or separation < limit - SLACK:
-            text = _nearness_in_words(who, separation, t, phase, limit, exact=exact)
-            yield _collision_remark(mission, text, limit, exact=exact)
+    for exact, (at, phase) in worst.items():
+        if at[0] <= 0 or at[0] < limit - SLACK:
+            yield _collision_remark(mission, at, phase, exact=exact)
 
 
-def _collision_remark(mission: Mission, text: str, limit: float, *, exact: bool) -> Remark:
+def _collision_remark(
+    mission: Mission, at: _Nearest, phase: str, why: str = "", *, exact: bool
+) -> Remark:
     """Remark on planned paths that come too close, which is a note where the guard of [avoidance] keeps the limit."""
+    (separation, t, who), limit = at, mission.limits.separation or 0.0
+    text = f"a separation of {separation:.2f} m at {t:.2f} s in '{phase}' (limit {limit:g} m)"
+    text = f"{agent_names(who)} have {text}{why}"
+    if separation <= 0:
+        may = "" if exact else "may "
+        text = f"{agent_names(who)} {may}collide at {t:.2f} s in '{phase}'{why}"
     if not exact:
         text += "; straight paths are assumed, as only distances guide the agents"
     elif is_left_to_avoidance(mission, "collision", limit):
@@ -81,40 +90,26 @@ def _collision_remark(mission: Mission, text: str, limit: float, *, exact: bool)
     return Remark("fails" if exact else "note", "collision", text)
 
 
-def _nearness_in_words(
-    who: tuple[int, ...], separation: float, t: float, phase: str, limit: float, *, exact: bool
-) -> str:
-    if separation <= 0:
-        return f"{agent_names(who)} {'' if exact else 'may '}collide at {t:.2f} s in '{phase}'"
-    return f"{agent_names(who)} have a separation of {separation:.2f} m at {t:.2f} s in '{phase}' (limit {limit:g} m)"
-
-
-def _crossing_remark(
-    mission: Mission,
-    planned: PlannedPhase,
-    at: tuple[float, float, tuple[int, ...]],
-    limit: float,
-) -> Remark:
+def _crossing_remark(mission: Mission, planned: PlannedPhase, at: _Nearest) -> Remark:
     """Remark on agents whose straight paths from one formation to the next come too close."""
-    (separation, t, who), (before, after) = at, planned.shapes
-    needed = sum(mission.agents.radius[i] for i in who) + limit
+    (separation, _, who), (before, after) = at, planned.shapes
+    radii = sum(mission.agents.radius[i] for i in who)
+    needed = radii + (mission.limits.separation or 0.0)
     origin = "the start" if before is None else f"'{before}'"
-    text = (
-        f"{_nearness_in_words(who, separation, t, planned.phase, limit, exact=planned.exact)}: their paths from"
-        f" {origin} to '{after}' cross with {max(0.0, separation + needed - limit):.2f} m from centre to centre. "
-    )
+    apart = f"{max(0.0, separation + radii):.2f} m from centre to centre"
+    text = f": their paths from {origin} to '{after}' cross with {apart}. "
     assert after is not None  # the phase changes the formation
     assert planned.path_ends is not None
-    apart = min(float(proximity.nearest(places).min()) for places in planned.path_ends)
-    spaced = f"place slots at least {math.sqrt(2) * needed:.2f} m apart (now {apart:.2f} m)"
+    least = min(float(proximity.nearest(places).min()) for places in planned.path_ends)
+    spaced = f"place slots at least {math.sqrt(2) * needed:.2f} m apart (now {least:.2f} m)"
     promised = mission.assigned_turn(before, after) is not None
     if promised:
         text += f"{spaced[0].upper()}{spaced[1:]}"
     else:
         text += 'Assign agents to near slots: assignment = "each"'
-    if not promised and apart < math.sqrt(2) * needed:
+    if not promised and least < math.sqrt(2) * needed:
         text += f"; and {spaced}"
-    return _collision_remark(mission, text, limit, exact=planned.exact)
+    return _collision_remark(mission, at, planned.phase, text, exact=planned.exact)
 
 
 def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -263,28 +258,20 @@ def waypoint_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             turns = ("attitude", turn), ("rates", spin)
             meets |= {what: math.degrees(np.linalg.norm(x)) for what, x in turns}
         for what, off in meets.items():
-            if off > (1.0 + _CLEARLY) * WAYPOINT_TOLERANCE[what]:
-                yield _miss_remark(mission, planned, what, off, exact=exact)
-
-
-def _miss_remark(
-    mission: Mission, planned: PlannedPhase, what: str, off: float, *, exact: bool
-) -> Remark:
-    """Remark on a goal that is missed by this much in position, velocity, attitude or rates."""
-    turns = what in ("attitude", "rates")
-    law, table = (mission.lqr.attitude, "lqr.attitude") if turns else (mission.lqr, "lqr")
-    remedy = f"greater weights {table}.S"
-    if law.horizon == "infinite":
-        remedy = f"greater weights {table}.Q, or horizon = 'finite'"
-    # Of a body under feedback, the rotation is planned as one about a fixed axis.
-    sure = exact and (planned.leg.phase.control == "tracking" or not turns)
-    return Remark(
-        "fails" if sure else "note",
-        "waypoint",
-        f"the waypoint of '{planned.phase}' {'is' if sure else 'may be'} missed, {off:.2g} {UNITS[what]} off in {what}"
-        f" at {planned.leg.arrival:.2f} s (limit {WAYPOINT_TOLERANCE[what]:g} {UNITS[what]}): give the phase more"
-        f" time, or {remedy}",
-    )
+            unit, most = UNITS[what], WAYPOINT_TOLERANCE[what]
+            if off <= (1.0 + _CLEARLY) * most:
+                continue
+            is_turn = what in ("attitude", "rates")
+            law, table = (mission.lqr.attitude, "lqr.attitude") if is_turn else (mission.lqr, "lqr")
+            remedy = f"greater weights {table}.S"
+            if law.horizon == "infinite":
+                remedy = f"greater weights {table}.Q, or horizon = 'finite'"
+            # Of a body under feedback, the rotation is planned as one about a fixed axis.
+            sure = exact and (phase.control == "tracking" or not is_turn)
+            how = f"{'is' if sure else 'may be'} missed, {off:.2g} {unit} off in {what}"
+            text = f"the waypoint of '{planned.phase}' {how} at {leg.arrival:.2f} s"
+            text += f" (limit {most:g} {unit}): give the phase more time, or {remedy}"
+            yield Remark("fails" if sure else "note", "waypoint", text)
 
 
 def limit_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:

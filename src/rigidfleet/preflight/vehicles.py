@@ -112,10 +112,8 @@ def _greatest_jump(
         if before.leg.end != after.leg.start:
             continue
         t = np.array([after.leg.start])
-        a, b = (
-            slot_derivatives(leg.reference, leg.motion, t, 3)[0, 2]
-            for leg in (before.leg, after.leg)
-        )
+        legs = before.leg, after.leg
+        a, b = (slot_derivatives(x.reference, x.motion, t, 3)[0, 2] for x in legs)
         jump = np.linalg.norm(b - a, axis=1)
         i = int(jump.argmax())
         up = np.array([0.0, 0.0, mission.gravity])
