@@ -47,12 +47,10 @@ def avoidance_notes(measured: Measurements) -> Iterator[str]:
     if not avoidance.guard:
         yield "[avoidance] without its guard guarantees nothing"
     elif not _least_margins(measured, "_lost"):
-        doubt = _why_not_proved(measured)
-        yield (
-            f"the guarantee of [avoidance] was held at every tick, but is not proved: {doubt}"
-            if doubt
-            else "the guarantee of [avoidance] is proved: at every tick, all vehicles could brake in time"
-        )
+        words = "is proved: at every tick, all vehicles could brake in time"
+        if doubt := _why_not_proved(measured):
+            words = f"was held at every tick, but is not proved: {doubt}"
+        yield f"the guarantee of [avoidance] {words}"
     yield from _body_notes(measured.result)
 
 

@@ -151,9 +151,8 @@ def greatest_thrust(
     """The planned thrust [N] that is nearest to its limit, its time [s], agent and limit [N]; None without a plan."""
     if not way:
         return None
-    weight = np.array([0.0, 0.0, mission.gravity])
-    needs = [np.linalg.norm(planned.acceleration + weight, axis=2) for planned in way]
-    needs = [mission.fleet.mass * need for need in needs]
+    mass, weight = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
+    needs = [mass * np.linalg.norm(planned.acceleration + weight, axis=2) for planned in way]
     return _nearest_to_limit(way, needs, mission.fleet.thrust_limit)
 
 
