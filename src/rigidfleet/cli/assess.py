@@ -16,7 +16,7 @@ from rigidfleet.errors import RigidfleetError
 
 if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
-    from rigidfleet.foreign.curves import Trajectories, looks_measured
+    from rigidfleet.foreign.curves import Trajectories
     from rigidfleet.result import Result
     from rigidfleet.simulation.as_logged import Doubts
 
@@ -204,6 +204,7 @@ def _judge(
     from rigidfleet.assessment import assess as judge
 
     if doubts is None:
+        from rigidfleet.foreign.curves import looks_measured
         from rigidfleet.simulation.trajectories import of_curves
 
         result = of_curves(read, **judged)
