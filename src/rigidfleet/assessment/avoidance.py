@@ -31,12 +31,11 @@ def guarantee_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
         return
     state = "held" if _why_not_proved(measured) else "proved"
     e = min(_least_margins(measured), key=lambda e: e.value, default=None)
-    words = f"the guarantee of [avoidance] is {state}: no vehicle has come near anything"
+    spare = "no vehicle has come near anything"
     if e is not None:
-        words = (
-            f"the guarantee of [avoidance] is {state}, with {value(e.value, 'm')} to spare at least"
-        )
+        spare = f"{value(e.value, 'm')} to spare at least"
         e = replace(e, value=max(e.value, 0.0))
+    words = f"the guarantee of [avoidance] is {state}: {spare}"
     yield limit_check(q, e, 0.0, words, passed=True)
 
 
