@@ -22,8 +22,7 @@ from pages import splice
 from scipy.signal import butter, lfilter
 
 import rigidfleet as rf
-from rigidfleet.foreign.curves import Trajectories
-from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
+from rigidfleet.foreign.curves import ASSUMED, Trajectories, curve_through_samples
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.setpoints import ways_of
 from rigidfleet.simulation.as_logged import Doubts, judge_log

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from rigidfleet.assessment import SHAPE_TOLERANCE, CheckResult, Verdict, assess
+from rigidfleet._common.waypoints import SHAPE_TOLERANCE
+from rigidfleet.assessment import Verdict, assess
 from rigidfleet.assessment.fits import Fit, fits_of
+from rigidfleet.assessment.verdict import CheckResult
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import attitude as att
 from rigidfleet.math import rigid_body

@@ -10,7 +10,8 @@ import pytest
 from rich.console import Console
 
 import rigidfleet as rf
-from rigidfleet.assessment import CheckResult, Verdict, safety
+from rigidfleet.assessment import Verdict, safety
+from rigidfleet.assessment.verdict import CheckResult
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.preflight.check import check as foresee
 from rigidfleet.reporting import html_page

@@ -14,8 +14,7 @@ import rigidfleet as rf
 from rigidfleet.assessment.alignment import align
 from rigidfleet.cli.app import main
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.foreign.curves import LoggedStates, Trajectories
-from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
+from rigidfleet.foreign.curves import ASSUMED, LoggedStates, Trajectories, curve_through_samples
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.smoothing import (
     PositionNoise,

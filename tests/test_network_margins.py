@@ -414,7 +414,7 @@ def test_lossy_passage_is_refused_and_fails():
 def test_edges_beyond_the_range_are_named():
     """Diagonals of the cube are longer than a range of 5 m, and the rest is checked without them."""
     cube = checked({"range": 5.0})
-    assert cube.network["cube"].unheard == 6
+    assert cube.network["cube"].unheard_edges == 6
     assert any("6 edges are longer than the range" in remark.text for remark in cube.remarks)
 
 

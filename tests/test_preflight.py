@@ -126,7 +126,7 @@ def test_collisions():
     assert "collision" in failures(found)
     topics = {remark.topic for remark in found.remarks}
     assert "assignment" in topics
-    assert found.assignments["shortest"].path_length < 0.1
+    assert found.assignments["shortest"].path_length_m < 0.1
     assert check(mission()).passed
 
 

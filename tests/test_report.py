@@ -14,7 +14,8 @@ import pytest
 from sample_flights import quadrotors
 
 from rigidfleet import plotting
-from rigidfleet.assessment import Extreme, Safety, assess, safety
+from rigidfleet.assessment import Safety, assess, safety
+from rigidfleet.assessment.verdict import Extreme
 from rigidfleet.cli.app import main
 from rigidfleet.errors import ResultError
 from rigidfleet.mission import Mission

@@ -109,11 +109,9 @@ class FactTable:
     @property
     def cells(self) -> list[list[Cell]]:
         """What stands in each row that is shown."""
+        shown, marks = self._columns_shown, self._has_marks
         return [
-            [
-                *(_cell(row.cells[k]) for k in self._columns_shown),
-                *[Cell(MARKS[row.level])] * self._has_marks,
-            ]
+            [_cell(row.cells[k]) for k in shown] + [Cell(MARKS[row.level])] * marks
             for row in self.rows
         ]
 

@@ -69,11 +69,9 @@ def replace_folder_atomically(path: Path, ours: re.Pattern[str]) -> Generator[Pa
         if target.exists():
             if not target.is_dir():
                 raise ResultError(f"{path}: is a file. Give the path of a folder.")
-            foreign = sorted(x.name for x in target.iterdir() if not ours.fullmatch(x.name))
-            if foreign:
-                raise ResultError(
-                    f"{path}: holds other files ({foreign[0]}), which are kept. Choose a new folder."
-                )
+            if foreign := [x.name for x in target.iterdir() if not ours.fullmatch(x.name)]:
+                why = f"holds other files ({min(foreign)}), which are kept"
+                raise ResultError(f"{path}: {why}. Choose a new folder.")
         target.parent.mkdir(parents=True, exist_ok=True)
         part.mkdir()
         yield part

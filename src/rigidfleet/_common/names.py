@@ -133,10 +133,8 @@ def _meaning_without_unit(name: str) -> ColumnMeaning:
     alone = len(words) == len(units) == 1 and len(plain) > 1 and plain not in ("min", "ns", "us")
     if (every & _IS["time"] or alone) and every <= _IS["time"] | _IS["time too"] | {*units}:
         return ColumnMeaning("time", units[-1] if units else "")
-    if (
-        every & (_IS["agent"] | _IS["thing"])
-        and every <= _IS["agent"] | _IS["thing"] | _IS["thing too"]
-    ):
+    named = _IS["agent"] | _IS["thing"]
+    if every & named and every <= named | _IS["thing too"]:
         return ColumnMeaning("agent" if every & _IS["agent"] else "thing")
     if hue := _HUE.fullmatch(plain):
         return ColumnMeaning(_HUES[hue[1]])

@@ -10,9 +10,11 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 import reprlib
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass
+from inspect import signature
 from types import NoneType, UnionType
 from typing import (
     TYPE_CHECKING,
@@ -121,11 +123,8 @@ def as_type(value: Any, kind: Any, where: str) -> Any:
         hints = get_type_hints(kind, include_extras=True)
         needed = getattr(kind, "__required_keys__", None)
         if needed is None:  # a dataclass
-            needed = {
-                f.name
-                for f in fields(kind)
-                if f.default is MISSING and f.default_factory is MISSING
-            }
+            parameters = signature(kind).parameters.values()
+            needed = {x.name for x in parameters if x.default is x.empty}
         known = hints.keys() - {"__others__"}
         if needed <= value.keys() and ("__others__" in hints or value.keys() <= known):
             made = {
@@ -133,7 +132,7 @@ def as_type(value: Any, kind: Any, where: str) -> Any:
                 for key, item in value.items()
             }
             return kind(**made)
-    raise DamagedError(f"{where} has an invalid value: {_short(value)}")
+    raise DamagedError(f"{where} has an invalid value: {reprlib.repr(value)[:60]}")
 
 
 #: Maximum magnitude of a number.
@@ -141,16 +140,7 @@ _HUGE = 1e300
 
 
 def _is_text(value: str) -> bool:
-    try:
-        value.encode()
-    except UnicodeEncodeError:  # a lone surrogate
-        return False
-    return True
-
-
-def _short(value: Any) -> str:
-    text = reprlib.repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return re.search("[\ud800-\udfff]", value) is None  # a lone surrogate
 
 
 def read_arrays(
@@ -169,13 +159,22 @@ def read_arrays(
     DamagedError
         An array is missing, has another type or shape, or the arrays are larger than a file of this size can be.
     """
+    import h5py
+
     datasets, known, numbers = {}, dict(sizes), 0
     for name, due in declared.items():
         if name not in file:
             if due.optional:
                 continue
             raise DamagedError(f"{name} is missing")
-        data = _dataset(file, name)
+        # Arrays are stored in this file: no link, no view of another file.
+        if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+            raise DamagedError(f"{name} is a link, not an array")
+        data = file[name]
+        if not isinstance(data, h5py.Dataset):
+            raise DamagedError(f"{name} is not an array")
+        if data.is_virtual or data.external:
+            raise DamagedError(f"{name} is stored in another file")
         kind = data.dtype.kind
         if kind not in ("iu" if due.whole else "f") or data.dtype.itemsize > 8:
             raise DamagedError(f"{name} has numbers of type {data.dtype}")
@@ -191,20 +190,6 @@ def read_arrays(
             raise DamagedError(f"{name} is larger than a file of {size:,} bytes can hold")
         datasets[name] = data
     return {name: data[...] for name, data in datasets.items()}
-
-
-def _dataset(file: h5py.File, name: str) -> h5py.Dataset:
-    """Return a dataset that is stored in this file: not a link, not a view of another file."""
-    import h5py
-
-    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-        raise DamagedError(f"{name} is a link, not an array")
-    data = file[name]
-    if not isinstance(data, h5py.Dataset):
-        raise DamagedError(f"{name} is not an array")
-    if data.is_virtual or data.external:
-        raise DamagedError(f"{name} is stored in another file")
-    return data
 
 
 def open_hdf5(data: bytes) -> h5py.File:

@@ -11,34 +11,14 @@ count from 1.
 
 from pathlib import Path
 
-from rigidfleet._common.waypoints import SHAPE_TOLERANCE, WAYPOINT_TOLERANCE
 from rigidfleet.assessment.checks import all_checks
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.notes import notes
-from rigidfleet.assessment.outcome import (
-    FLIPPED,
-    CheckResult,
-    Extreme,
-    PhaseVerdict,
-    Waypoint,
-)
 from rigidfleet.assessment.safety import Safety, safety
 from rigidfleet.assessment.verdict import Verdict
 from rigidfleet.result import Result, as_result
 
-__all__ = [
-    "FLIPPED",
-    "SHAPE_TOLERANCE",
-    "WAYPOINT_TOLERANCE",
-    "CheckResult",
-    "Extreme",
-    "PhaseVerdict",
-    "Safety",
-    "Verdict",
-    "Waypoint",
-    "assess",
-    "safety",
-]
+__all__ = ["Safety", "Verdict", "assess", "safety"]
 
 
 def assess(result: Result | str | Path) -> Verdict:
@@ -47,9 +27,9 @@ def assess(result: Result | str | Path) -> Verdict:
     The flight fails if
 
     - it is incomplete, or a phase did not settle;
-    - a formation is off by more than `SHAPE_TOLERANCE`, mirrored, flipped or out of order, at the end of an
+    - a formation is off by more than it allows (`mission.schema`), mirrored, flipped or out of order, at the end of an
       establish or reshape phase or at the end of the flight;
-    - a waypoint is missed by more than `WAYPOINT_TOLERANCE`;
+    - a waypoint is missed by more than 0.1 m, 0.1 m/s, 1 deg or 1 deg/s;
     - agents collide with each other or with an obstacle;
     - agents that track slots come nearer to each other than planned, by more than `limits.separation_allowance`; or
     - a limit of the mission is exceeded.

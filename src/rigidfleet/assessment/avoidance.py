@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet._common.quantities import Quantity
 from rigidfleet.assessment.measure import Measurements
-from rigidfleet.assessment.outcome import CheckResult, Extreme, limit_check, value
+from rigidfleet.assessment.verdict import CheckResult, Extreme, limit_check, value
 from rigidfleet.result import Result
 
 #: Rate below which the clock counts as slowed: it comes back to 1 by an exponential.
@@ -31,39 +31,26 @@ def guarantee_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
         return
     state = "held" if _why_not_proved(measured) else "proved"
     e = min(_least_margins(measured), key=lambda e: e.value, default=None)
-    words = f"the guarantee of [avoidance] is {state}: no vehicle has come near anything"
+    spare = "no vehicle has come near anything"
     if e is not None:
-        words = (
-            f"the guarantee of [avoidance] is {state}, with {value(e.value, 'm')} to spare at least"
-        )
+        spare = f"{value(e.value, 'm')} to spare at least"
         e = replace(e, value=max(e.value, 0.0))
+    words = f"the guarantee of [avoidance] is {state}: {spare}"
     yield limit_check(q, e, 0.0, words, passed=True)
 
 
 def avoidance_notes(measured: Measurements) -> Iterator[str]:
     """What the layers of avoidance did, and what the guarantee is worth."""
-    avoidance, result = measured.mission.avoidance, measured.result
-    if avoidance is None:
+    if (avoidance := measured.mission.avoidance) is None:
         return
     if not avoidance.guard:
         yield "[avoidance] without its guard guarantees nothing"
     elif not _least_margins(measured, "_lost"):
-        doubt = _why_not_proved(measured)
-        yield (
-            f"the guarantee of [avoidance] was held at every tick, but is not proved: {doubt}"
-            if doubt
-            else "the guarantee of [avoidance] is proved: at every tick, all vehicles could brake in time"
-        )
-    yield from _body_notes(result)
-    for name, words in (("barrier", "barriers changed"), ("guard", "the guard replaced")):
-        every = [p.extremes[name] for p in result.phases if name in p.extremes]
-        if every:
-            most = max(every, key=lambda x: x.value)
-            first = min(x.time for x in every)
-            yield (
-                f"{words} what vehicles were asked for, first at {first:.2f} s, most of agent {most.who + 1}: at"
-                f" {100 * most.value:.2g} % of the ticks of a phase"
-            )
+        words = "is proved: at every tick, all vehicles could brake in time"
+        if doubt := _why_not_proved(measured):
+            words = f"was held at every tick, but is not proved: {doubt}"
+        yield f"the guarantee of [avoidance] {words}"
+    yield from _body_notes(measured.result)
 
 
 def clock_notes(result: Result) -> Iterator[str]:

@@ -15,7 +15,7 @@ from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.assessment.avoidance import guarantee_check
 from rigidfleet.assessment.fits import is_rigid
 from rigidfleet.assessment.measure import Measurements
-from rigidfleet.assessment.outcome import (
+from rigidfleet.assessment.verdict import (
     FLIPPED,
     SLACK,
     TOUCH_DOWN,
@@ -180,10 +180,8 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
             rigid = is_rigid(measured.result.position[last][left], place[edges])
             state = "rigid, but" if rigid else "held by its edges, but"
             words = f"'{p.formation}' is {state} {wanted}: all {len(edges)} edges hold, yet {words}"
-        elif not passed:
-            words = f"'{p.formation}' is not reached: {words}"
         else:
-            words = f"'{p.formation}' is reached: {words}"
+            words = f"'{p.formation}' is {'' if passed else 'not '}reached: {words}"
         yield _check_at_end(p, "shape", passed, words, fit.error, fit.limit, "m", who=who)
         if fit.in_order is not None:
             words = f"the agents of '{p.formation}' are {'' if fit.in_order else 'not '}in order"
@@ -246,22 +244,18 @@ def _touch_down_checks(measured: Measurements, phases: list[PhaseVerdict]) -> It
             continue
         k = measured.parts[i].stop - 1
         down = -measured.result.velocity[k, :, 2]
-        who = np.flatnonzero(measured.left[k] & (measured.closeness.each[k] <= PAD))
-        who = who[measured.obstacles_stood_on(np.full(len(who), k), who).any(axis=0)]
-        if not len(who):
+        low = np.flatnonzero(measured.left[k] & (measured.closeness.each[k] <= PAD))
+        low = low[measured.obstacles_stood_on(np.full(len(low), k), low).any(axis=0)]
+        if not len(low):
             yield _check_at_end(p, "touch_down", False, "no vehicle is on the ground")
             continue
-        worst = int(who[down[who].argmax()])
-        speed = max(0.0, float(down[worst]))
-        words = (
-            f"agent {worst + 1} touches down at {value(speed, 'm/s')} (limit {TOUCH_DOWN:g} m/s)"
-        )
+        worst = int(low[down[low].argmax()])
+        who, speed = f"agent {worst + 1}", max(0.0, float(down[worst]))
+        words = f"{who} touches down at {value(speed, 'm/s')} (limit {TOUCH_DOWN:g} m/s)"
         if (off := int(np.isfinite(measured.result.motors_off).sum())) > 0:
             words += f"; {off} vehicle{'s' if off > 1 else ''} may switch off"
-        passed = speed <= TOUCH_DOWN
-        yield _check_at_end(
-            p, "touch_down", passed, words, speed, TOUCH_DOWN, "m/s", who=f"agent {worst + 1}"
-        )
+        judged = speed <= TOUCH_DOWN, words, speed, TOUCH_DOWN, "m/s"
+        yield _check_at_end(p, "touch_down", *judged, who=who)
 
 
 def _corner_check(measured: Measurements) -> Iterator[CheckResult]:
@@ -401,9 +395,8 @@ def abandonment_check(measured: Measurements) -> Iterator[CheckResult]:
         return
     parts = [f"'{name}' was left and is not judged" for name in left]
     if never:
-        parts.append(
-            f"{', '.join(map(repr, never))} {'was' if len(never) == 1 else 'were'} not flown"
-        )
+        were = "was" if len(never) == 1 else "were"
+        parts.append(f"{', '.join(map(repr, never))} {were} not flown")
     words = f"after the {what} at {at:.2f} s, {'; '.join(parts)}"
     yield CheckResult(
         "abandoned", True, words, float(len(left + never)), when=when, who=who, judged=False

@@ -21,8 +21,7 @@ import numpy as np
 from rigidfleet._common.quantities import quantity
 from rigidfleet.assessment.alignment import Alignment
 from rigidfleet.assessment.measure import Measurements
-from rigidfleet.assessment.outcome import CheckResult, keeps_limit, value
-from rigidfleet.assessment.verdict import Verdict
+from rigidfleet.assessment.verdict import CheckResult, Verdict, keeps_limit, value
 from rigidfleet.math import proximity
 from rigidfleet.math.smoothing import NoiseEstimate
 from rigidfleet.result import Result

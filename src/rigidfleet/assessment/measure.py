@@ -12,7 +12,7 @@ import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, Quantity, quantity
 from rigidfleet.assessment.fits import Fit, angle_between, fits_of
-from rigidfleet.assessment.outcome import Extreme, PhaseVerdict, Waypoint, value
+from rigidfleet.assessment.verdict import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.result import PAD, Extremum, PhaseRecord, Result

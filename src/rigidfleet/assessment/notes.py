@@ -11,7 +11,7 @@ from rigidfleet.assessment.avoidance import avoidance_notes, clock_notes
 from rigidfleet.assessment.checks import abandonment_check
 from rigidfleet.assessment.fits import angle_between
 from rigidfleet.assessment.measure import Measurements
-from rigidfleet.assessment.outcome import DIP, FLIPPED, PhaseVerdict, value
+from rigidfleet.assessment.verdict import DIP, FLIPPED, PhaseVerdict, value
 
 #: A speed [m/s] and an extent [m] from which units are doubted.
 _FAST, _WIDE = 100.0, 20_000.0

@@ -9,8 +9,7 @@ import numpy as np
 from rigidfleet._common.facts import Fact
 from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.assessment.measure import Measurements
-from rigidfleet.assessment.outcome import Extreme, keeps_limit
-from rigidfleet.assessment.verdict import Verdict
+from rigidfleet.assessment.verdict import Extreme, Verdict, limit_check
 from rigidfleet.result import Result
 
 
@@ -73,19 +72,15 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
     measured, checks = Measurements(result), verdict.by_name
     rows = []
     for q in QUANTITIES.values():
-        limit, worst, passed, undecided, interval = None, None, True, False, None
-        if (check := checks.get(q.name)) is not None:
-            limit, passed = check.limit, check.passed
-            undecided, interval = check.undecided, check.interval
-            if check.worst is not None and check.when is not None:
-                worst = Extreme(check.worst, check.when, check.who, check.phase, check.at_samples)
-        elif q.monitored and not q.way:
-            limit, worst = q.limit_of(result.mission), measured.worst(q.name)
-        if (q.key or q.limit) and (limit is not None or worst is not None):
-            limit = None if limit is None or not np.isfinite(limit) else limit
-            if check is None and worst is not None and limit is not None:
-                passed = keeps_limit(q, worst.value, limit)
-            bound = display_unit(q.unit), q.at_least, limit
-            judged = worst, passed, undecided, interval
-            rows.append(Safety(q.name_in_words, q.text, *bound, *judged))
+        check = checks.get(q.name)
+        if check is None and q.monitored and not q.way:
+            check = limit_check(q, measured.worst(q.name), q.limit_of(result.mission), q.text)
+        if not (q.key or q.limit) or check is None or check.worst is check.limit is None:
+            continue
+        limit, worst = check.limit, None
+        if check.worst is not None and check.when is not None:
+            worst = Extreme(check.worst, check.when, check.who, check.phase, check.at_samples)
+        bound = display_unit(q.unit), q.at_least, limit if np.isfinite(limit or 0.0) else None
+        judged = worst, check.passed, check.undecided, check.interval
+        rows.append(Safety(q.name_in_words, q.text, *bound, *judged))
     return rows

@@ -204,7 +204,7 @@ def _judge(
     from rigidfleet.assessment import assess as judge
 
     if doubts is None:
-        from rigidfleet.foreign.samples import looks_measured
+        from rigidfleet.foreign.curves import looks_measured
         from rigidfleet.simulation.trajectories import of_curves
 
         result = of_curves(read, **judged)

@@ -293,11 +293,8 @@ def _rows_of_vehicles(
         (code, labels), thing = coded[k], kinds[k] == "thing"
         # What numbers the rows, or words for parts of a flight, are no names of vehicles.
         counts = np.ptp(time) > 0.0 and are_row_numbers(labels, n)
-        if (
-            kinds[k] in ("agent", "thing")
-            and not counts
-            and not (thing and alone and _are_parts_of_one_way(code, time, place))
-        ):
+        unnamed = counts or (thing and alone and _are_parts_of_one_way(code, time, place))
+        if kinds[k] in ("agent", "thing") and not unnamed:
             named.append(k)
             if "" in labels:
                 line = table.lines[np.flatnonzero(code == labels.index(""))[0]]

@@ -21,8 +21,7 @@ from rigidfleet._common.text import first_few
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign import logs, poses, shows, texts
 from rigidfleet.foreign.columns import Units, units_of
-from rigidfleet.foreign.curves import Trajectories
-from rigidfleet.foreign.samples import ASSUMED
+from rigidfleet.foreign.curves import ASSUMED, Trajectories
 from rigidfleet.math.piecewise import Piecewise
 
 __all__ = ["Gaps", "Interpolation", "Spans", "Trajectories", "read_trajectories"]
@@ -260,10 +259,9 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
     rest = [p for p in inside if p.is_file() and p not in read]
     for p in rest:
         hidden = _may_have_trajectories(p) and not _is_hidden(p)
-        with suppress(TrajectoryError):
-            hidden = hidden or bool(
-                _read_file([p], "linear", units_of(None, None), (), None, False)
-            )
+        if not hidden:
+            with suppress(TrajectoryError):
+                hidden = bool(_read_file([p], "linear", units_of(None, None), (), None, False))
         if hidden:
             why = f"may be a further vehicle, but is not read beside {listed[0][0].name}"
             raise _error(p, why, "Give its path as well, or move it out of the folder")

@@ -25,8 +25,7 @@ import numpy as np
 
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet._common.text import first_few
-from rigidfleet.foreign.curves import LoggedStates, Trajectories
-from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
+from rigidfleet.foreign.curves import ASSUMED, LoggedStates, Trajectories, curve_through_samples
 from rigidfleet.math.geodesy import Geodetic, enu_of
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats, Ints

@@ -200,12 +200,8 @@ def _floats(value: Any, shape: tuple[int | None, ...], where: str) -> Any:
     except (TypeError, ValueError, OverflowError):
         numbers = np.array(np.nan)
     fits = [n in (None, m) for n, m in zip(shape, numbers.shape, strict=False)]
-    if (
-        numbers.ndim != len(shape)
-        or not all(fits)
-        or not np.isfinite(numbers).all()
-        or isinstance(value, str | bool)
-    ):
+    right = numbers.ndim == len(shape) and all(fits) and np.isfinite(numbers).all()
+    if not right or isinstance(value, str | bool):
         words = "numbers" if shape else "a number"
         raise fault(f"{where}: has {str(value)[:60]!r} where {words} must be")
     return numbers if shape else float(numbers)

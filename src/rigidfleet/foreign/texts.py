@@ -7,8 +7,14 @@ import numpy as np
 from rigidfleet._common.names import CRAZYFLIE
 from rigidfleet._common.tables import TextTable, fault
 from rigidfleet.foreign.columns import Units, are_row_numbers, parse_table, read_tracks
-from rigidfleet.foreign.curves import NAMES, Trajectories, curve_through_states, rows_to_curve
-from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
+from rigidfleet.foreign.curves import (
+    ASSUMED,
+    NAMES,
+    Trajectories,
+    curve_through_samples,
+    curve_through_states,
+    rows_to_curve,
+)
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.splines import POWERS
 
@@ -30,9 +36,8 @@ def read_text(data: bytes, stem: str, interpolation: str, units: Units) -> Traje
     if table.find("duration", "x^0"):
         for k, q in enumerate(table.kinds):
             labels = table.codes(k)[1] if q.kind in ("agent", "thing") else []
-            if len(labels) > 1 and (
-                q.kind == "agent" or not are_row_numbers(labels, len(table.lines))
-            ):
+            counts = q.kind == "thing" and are_row_numbers(labels, len(table.lines))
+            if len(labels) > 1 and not counts:
                 why = f"has polynomials of several vehicles in the column {table.names[k]!r}"
                 raise fault(why, "Give each vehicle a table")
         curve = _curve_of_coefficients(table)

@@ -196,9 +196,8 @@ def _read_trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) 
     Where a file has samples, they are joined by the spline with the least jerk (C4): it is not only judged but flown.
     """
     from rigidfleet.foreign.columns import Doubt
-    from rigidfleet.foreign.curves import curve_to_rows, least_jerk_curve
+    from rigidfleet.foreign.curves import ASSUMED, curve_to_rows, least_jerk_curve
     from rigidfleet.foreign.files import read_trajectories
-    from rigidfleet.foreign.samples import ASSUMED
 
     try:
         read = read_trajectories(name, units=said.get("units"), axes=said.get("axes"))

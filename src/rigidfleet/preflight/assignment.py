@@ -38,19 +38,16 @@ def assignment_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         x = planned.position - (masses @ planned.position)[:, None] / masses.sum()
         length = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
         clearance = assignment.closest_approach(*planned.path_ends, mission.agents.radius)[0]
-        order = tuple(other.assigned_slots[first.formation].tolist())
+        order = tuple((other.assigned_slots[first.formation] + 1).tolist())
         preflight.assignments[name] = Assignment(order, length, clearance)
     radius = mission.fleet.radius
     now, short, safe = preflight.assignments.values()
-    if short.path_length < (1 - _WORTH) * now.path_length - _SHORT:
-        text = (
-            f'assignment = "shortest" reduces the total path length from {now.path_length:.1f} m to'
-            f" {short.path_length:.1f} m"
-        )
+    before, after = now.path_length_m, short.path_length_m
+    if after < (1 - _WORTH) * before - _SHORT:
+        text = f'assignment = "shortest" reduces the total path length from {before:.1f} m to {after:.1f} m'
         yield Remark("note", "assignment", text)
-    if safe.min_clearance > now.min_clearance + 0.05 and now.min_clearance < 2 * radius.max():
-        text = (
-            f'assignment = "safe" increases the minimum clearance on the paths from {now.min_clearance:.2f} m to'
-            f" {safe.min_clearance:.2f} m"
-        )
+    before, after = now.min_clearance_m, safe.min_clearance_m
+    if after > before + 0.05 and before < 2 * radius.max():
+        what = "increases the minimum clearance on the paths"
+        text = f'assignment = "safe" {what} from {before:.2f} m to {after:.2f} m'
         yield Remark("note", "assignment", text)

@@ -16,6 +16,7 @@ from rigidfleet.mission.files import notes_on_files
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.planning.vehicles import lag_times, vehicle_lags
+from rigidfleet.preflight import trajectory
 from rigidfleet.preflight.assignment import assignment_remarks
 from rigidfleet.preflight.avoidance import braking_remarks
 from rigidfleet.preflight.findings import Preflight, Remark
@@ -26,15 +27,6 @@ from rigidfleet.preflight.margins import check_margins, margin_remarks
 from rigidfleet.preflight.network import check_network, network_remarks
 from rigidfleet.preflight.obstacles import boundary_remarks, obstacle_remarks
 from rigidfleet.preflight.offsets import offset_remarks
-from rigidfleet.preflight.trajectory import (
-    disturbance_remarks,
-    downwash_remarks,
-    greatest_speed,
-    limit_remarks,
-    separation_remarks,
-    thrust_remarks,
-    waypoint_remarks,
-)
 from rigidfleet.preflight.vehicles import check_vehicles, vehicle_remarks
 
 
@@ -66,8 +58,9 @@ def check(
     progress("planned paths")
     planned, known = preview(mission)
     preflight = Preflight(mission, formations, check_gains(mission, formations), planned)
-    preflight.speed = greatest_speed(planned, slice(3))
-    preflight.vertical_speed = greatest_speed(planned, slice(2, 3))
+    preflight.speed = trajectory.greatest_speed(planned, slice(3))
+    preflight.vertical_speed = trajectory.greatest_speed(planned, slice(2, 3))
+    preflight.thrust = trajectory.greatest_thrust(mission, planned)
     if not known:
         preflight.judged_to = float(planned[-1].time[-1]) if planned else 0.0
     if lags := vehicle_lags(mission):
@@ -83,18 +76,18 @@ def check(
         *gain_remarks(mission, preflight),
         *margin_remarks(preflight),
         *network_remarks(preflight),
-        *separation_remarks(mission, preflight),
-        *downwash_remarks(mission, preflight),
+        *trajectory.separation_remarks(mission, preflight),
+        *trajectory.downwash_remarks(mission, preflight),
         *assignment_remarks(mission, preflight),
-        *thrust_remarks(mission, preflight),
+        *trajectory.step_remarks(mission, preflight),
         *vehicle_remarks(mission, preflight),
         *braking_remarks(mission),
-        *disturbance_remarks(mission, preflight),
+        *trajectory.disturbance_remarks(mission, preflight),
         *offset_remarks(mission, preflight),
         *obstacle_remarks(mission, preflight),
         *boundary_remarks(mission, preflight),
-        *limit_remarks(mission, preflight),
-        *waypoint_remarks(mission, preflight),
+        *trajectory.limit_remarks(mission, preflight),
+        *trajectory.waypoint_remarks(mission, preflight),
         *loss_remarks(mission, preflight),
     ]
     if planned and (words := mission.landings_in_words(planned[-1].position[-1])):

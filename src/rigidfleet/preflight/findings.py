@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
 
 from rigidfleet._common.facts import (
     Cell,
@@ -86,9 +88,9 @@ class FormationCheck:
     held_by : "tracking" if slots are tracked in every phase with this formation, "distances" if not, "nothing" if no
         phase has it
     realisations : other shapes with the same distances; None if they were not searched
-    method : how the constraint force is solved
+    solve : how the constraint force is solved
     spectrum : of a large formation, instead of its rigidity
-    spacing : least distance between two slots, centre to centre [m]; infinite if there are no slots
+    spacing_m : least distance between two slots, centre to centre [m]; infinite if there are no slots
     colours : number of colours of its lights; 0 if it keeps the lights before
     skipped : whether the formation was not checked because there are too many
     """
@@ -97,10 +99,10 @@ class FormationCheck:
     rigidity: Rigidity | None
     held_by: Literal["tracking", "distances", "nothing"]
     realisations: Realisations | None = None
-    method: solvers.Method = "dense"
+    solve: solvers.Method = "dense"
     spectrum: Spectrum | None = None
     skipped: bool = False
-    spacing: float = math.inf
+    spacing_m: float = math.inf
     colours: int = 0
 
 
@@ -112,33 +114,33 @@ class GainsCheck:
     ----------
     stabilised : whether there is feedback
     margin : 2 alpha beta^2 / gamma; above 1 the law is stable
-    settling_time : time to settle to 2 % [s]; None if unknown
+    settling_time_s : time to settle to 2 % [s]; None if unknown
     overshoot : as a fraction; None if unknown
-    force : by formation, maximum force per error of one distance [N/m]
+    force_per_error_n_m : by formation, maximum force per error of one distance [N/m]
     """
 
     stabilised: bool
     margin: float
-    settling_time: float | None
+    settling_time_s: float | None
     overshoot: float | None
-    force: dict[str, float]
+    force_per_error_n_m: dict[str, float]
 
     @property
     def table(self) -> FactTable:
         """Stability, and what a step of 1 cm in the error of an edge causes."""
         if not self.stabilised:
             return table_of([{"gains": "no feedback: stabilisation = 'none'"}])
-        name, force = max(self.force.items(), key=lambda item: item[1], default=("", None))
+        forces = self.force_per_error_n_m
+        name, force = max(forces.items(), key=lambda item: item[1], default=("", None))
         row = {
-            "gains": "stable", "margin": self.margin, "settles in [s]": self.settling_time,
+            "gains": "stable", "margin": self.margin, "settles in [s]": self.settling_time_s,
             "overshoot [%]": self.overshoot and 100 * self.overshoot, "force of 1 cm [N]": force and force / 100,
             "in": name,
         }  # fmt: skip
         return table_of([row], ("in",))
 
 
-@dataclass(frozen=True)
-class FormationMargins:
+class FormationMargins(NamedTuple):
     """Margins of all loops of a formation, or of a way between two: the smallest over its shapes and attitudes.
 
     Attributes
@@ -149,6 +151,10 @@ class FormationMargins:
 
     margins: Margins
     largest_pole: float
+
+    def data(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return self.margins.data() | {"largest_p": self.largest_pole}
 
 
 @dataclass(frozen=True)
@@ -177,13 +183,7 @@ class MarginsCheck:
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        return {
-            "tracking": None if self.tracking is None else self.tracking.data(),
-            "formations": {
-                where: f.margins.data() | {"largest_p": f.largest_pole}
-                for where, f in self.formations.items()
-            },
-        }
+        return {"tracking": self.tracking, "formations": self.formations}
 
 
 @dataclass(frozen=True)
@@ -192,53 +192,45 @@ class FormationNetwork:
 
     Attributes
     ----------
-    broadcasts : of all vehicles a second [Hz]
-    tick : time between two evaluations of the law [s]
-    delay, own_delay : last stable delay, and the greatest one of the mission, in ticks; 0 if not even 1 is stable
+    broadcasts_hz : of all vehicles a second [Hz]
+    tick_s : time between two evaluations of the law [s]
+    delay_ticks, own_delay_ticks : last stable delay, and the greatest one of the mission; 0 if not even 1 is stable
     loss, own_loss : share of independent losses up to which it is stable in mean square at its own delay, and the
         mission's; None if it is not even without losses
     growing : share of sampled linear flights, with the mission's own bursts, jitter and time-outs, in which errors
         grow; None if there was no need for them
-    unheard : number of edges that are longer than the range
+    unheard_edges : number of edges that are longer than the range
     """
 
-    broadcasts: float
-    tick: float
-    delay: int
-    own_delay: int
+    broadcasts_hz: float
+    tick_s: float
+    delay_ticks: int
+    own_delay_ticks: int
     loss: float | None
     own_loss: float
     growing: float | None = None
-    unheard: int = 0
+    unheard_edges: int = 0
 
     @property
     def bears_network(self) -> bool:
         """Whether the mission's own network is within what the formation bears."""
-        within = (
-            self.loss is not None and self.own_loss <= self.loss and self.own_delay <= self.delay
-        )
+        share = -1.0 if self.loss is None else self.loss
+        within = self.own_loss <= share and self.own_delay_ticks <= self.delay_ticks
         return within and (self.growing or 0.0) <= 0.5
 
     def weaker_of(self, other: FormationNetwork) -> FormationNetwork:
         """The one of both that bears less."""
-        return min(self, other, key=lambda f: (f.bears_network, f.delay, f.loss or 0.0))
+        return min(self, other, key=lambda f: (f.bears_network, f.delay_ticks, f.loss or 0.0))
 
     @property
     def row(self) -> dict[str, Any]:
         """What it bears and what it has, by the names of columns; losses are stable in mean square."""
-        ms, bears = 1e3 * self.tick, None if self.loss is None else 100 * self.loss
+        ms, bears = 1e3 * self.tick_s, None if self.loss is None else 100 * self.loss
         return {
-            "broadcasts [/s]": self.broadcasts, "bears delay [ms]": ms * self.delay, "has [ms]": ms * self.own_delay,
-            "bears loss [%]": bears, "has [%]": None if bears is None else 100 * self.own_loss,
+            "broadcasts [/s]": self.broadcasts_hz, "bears delay [ms]": ms * self.delay_ticks,
+            "has [ms]": ms * self.own_delay_ticks, "bears loss [%]": bears,
+            "has [%]": None if bears is None else 100 * self.own_loss,
             "flights that grow [%]": None if self.growing is None else 100 * self.growing,
-        }  # fmt: skip
-
-    def data(self) -> dict[str, Any]:
-        """Plain data for JSON."""
-        return {
-            "broadcasts_hz": self.broadcasts, "tick_s": self.tick, "delay_ticks": self.delay,
-            "own_delay_ticks": self.own_delay, "loss": self.loss, "own_loss": self.own_loss, "growing": self.growing,
-            "unheard_edges": self.unheard,
         }  # fmt: skip
 
 
@@ -248,14 +240,14 @@ class Assignment:
 
     Attributes
     ----------
-    order : slot of each agent, from 0
-    path_length : total length of all paths [m]
-    min_clearance : minimum clearance between agents on them [m]
+    order : slot of each agent, from 1
+    path_length_m : total length of all paths [m]
+    min_clearance_m : minimum clearance between agents on them [m]
     """
 
     order: tuple[int, ...]
-    path_length: float
-    min_clearance: float
+    path_length_m: float
+    min_clearance_m: float
 
 
 @dataclass(frozen=True)
@@ -281,6 +273,15 @@ class Disturbed:
     offset: tuple[float, str]
     lost: tuple[tuple[int, float], ...]
 
+    def data(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            **{f"{name}_n": getattr(self, name) for name in _FORCES},
+            "thrust": _by_name("thrust_n time_s who limit_n", self.thrust),
+            "offset": _by_name("offset_m who", self.offset),
+            "lost": [_by_name("agent time_s", (i + 1, t)) for i, t in self.lost],
+        }
+
 
 @dataclass(frozen=True)
 class VehicleCheck:
@@ -298,18 +299,16 @@ class VehicleCheck:
 
     rotor_force: tuple[float, float, str, float, str]
     tilt: tuple[float, float, str, str]
-    jump: tuple[float, float, float, str] | None
+    jump: tuple[float, float, float, str] | None = None
     beyond: tuple[float, str, str, str] | None = None
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
         return {
-            "rotor_force": _by_name(
-                ("force_n", "time_s", "who", "limit_n", "phase"), self.rotor_force
-            ),
-            "tilt": _by_name(("tilt_deg", "time_s", "who", "phase"), self.tilt),
-            "jump": _by_name(("acceleration_m_s2", "tilt_deg", "time_s", "phase"), self.jump),
-            "beyond": _by_name(("share", "who", "phase", "needs"), self.beyond),
+            "rotor_force": _by_name("force_n time_s who limit_n phase", self.rotor_force),
+            "tilt": _by_name("tilt_deg time_s who phase", self.tilt),
+            "jump": _by_name("acceleration_m_s2 tilt_deg time_s phase", self.jump),
+            "beyond": _by_name("share who phase needs", self.beyond),
         }
 
 
@@ -410,7 +409,7 @@ class Preflight(Shown):
             tables = [_formation_table(self.formations), graphs, self.gains.table, *tables]
         words = "about", "result"
         ways = [
-            {"assignment": name, "path length [m]": a.path_length, "least clearance [m]": a.min_clearance}
+            {"assignment": name, "path length [m]": a.path_length_m, "least clearance [m]": a.min_clearance_m}
             for name, a in self.assignments.items()
         ]  # fmt: skip
         return [
@@ -425,7 +424,7 @@ class Preflight(Shown):
         """Worst values of the planned paths, with their limits."""
         if self.is_show:
             places = {"start": float(proximity.nearest(self.mission.fleet.position).min())}
-            places |= {f"'{f.name}'": f.spacing for f in self.formations}
+            places |= {f"'{f.name}'": f.spacing_m for f in self.formations}
             for where, apart in places.items():
                 yield Fact("spacing, centre to centre", apart, "m", who=where)
         for name, (_, unit) in _WORST.items():
@@ -483,75 +482,35 @@ class Preflight(Shown):
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON, agents and slots counted from 1."""
-        g = self.gains
+        proof = "phase separation_m time_s agents how"
         data = {
             "passed": self.passed,
-            "remarks": [vars(remark) for remark in self.remarks],
-            "formations": {
-                f.name: {
-                    "held_by": f.held_by,
-                    "rigidity": None if f.rigidity is None else f.rigidity.data(),
-                    "realisations": None if f.realisations is None else f.realisations.data(),
-                    "solve": f.method,
-                    "spectrum": None if f.spectrum is None else f.spectrum.data(),
-                    "spacing_m": f.spacing,
-                    "colours": f.colours,
-                }
-                for f in self.formations
-            },
-            "gains": {
-                "stabilised": g.stabilised,
-                "margin": g.margin,
-                "settling_time_s": g.settling_time,
-                "overshoot": g.overshoot,
-                "force_per_error_n_m": g.force,
-            },
-            "margins": None if self.margins is None else self.margins.data(),
-            "network": {name: f.data() for name, f in self.network.items()},
-            "vehicles": None if self.vehicles is None else self.vehicles.data(),
+            "remarks": self.remarks,
+            "formations": {f.name: f for f in self.formations},
+            "gains": self.gains,
+            "margins": self.margins,
+            "network": self.network,
+            "vehicles": self.vehicles,
             "reserve_s": self.reserve,
-            "disturbances": None
-            if (d := self.disturbed) is None
-            else {
-                **{f"{name}_n": getattr(d, name) for name in _FORCES},
-                "thrust": _by_name(("thrust_n", "time_s", "who", "limit_n"), d.thrust),
-                "offset": _by_name(("offset_m", "who"), d.offset),
-                "lost": [_by_name(("agent", "time_s"), (i + 1, t)) for i, t in d.lost],
-            },
+            "disturbances": self.disturbed,
             "paths": {
                 "judged_to_s": self.judged_to,
                 "guessed_phases": [
                     planned.phase for planned in self.planned_phases if not planned.exact
                 ],
                 **{
-                    name: _by_name((key, "time_s", "who", "limit_n"), getattr(self, name))
+                    name: _by_name(f"{key} time_s who limit_n", getattr(self, name))
                     for name, (key, _) in _WORST.items()
                 },
                 "certificates": [
-                    {
-                        "phase": phase,
-                        "separation_m": c.separation,
-                        "time_s": c.time,
-                        "agents": [i + 1 for i in c.agents],
-                        "how": c.how,
-                    }
-                    for phase, c in self.certificates.items()
+                    _by_name(proof, (phase, least, t, np.add(who, 1), how))
+                    for phase, (least, t, who, how) in self.certificates.items()
                 ],
                 "clearance": [
-                    _by_name(("obstacle", "clearance_m", "time_s", "who"), c)
-                    for c in self.clearance
+                    _by_name("obstacle clearance_m time_s who", c) for c in self.clearance
                 ],
-                "gaps": [
-                    _by_name(("between", "wide_m", "takes_m", "time_s"), g) for g in self.gaps
-                ],
-                "assignments": {
-                    name: {
-                        "order": [s + 1 for s in a.order],
-                        "path_length_m": a.path_length,
-                        "min_clearance_m": a.min_clearance,
-                    }
-                    for name, a in self.assignments.items()
-                },
+                "gaps": [_by_name("between wide_m takes_m time_s", g) for g in self.gaps],
+                "assignments": self.assignments,
             },
         }
         return to_json_data(data)
@@ -561,7 +520,7 @@ def _scene_words(f: FormationCheck) -> str:
     """What concerns a formation of a show, besides its spacing."""
     parts = ["not used in any phase"] if f.held_by == "nothing" else []
     parts += [f"{f.colours} colour{'s' * (f.colours > 1)} of lights"] if f.colours else []
-    parts += [f"edges solved by {solvers.WORDS[f.method]}"] if f.method != "dense" else []
+    parts += [f"edges solved by {solvers.WORDS[f.solve]}"] if f.solve != "dense" else []
     return "; ".join(parts)
 
 
@@ -581,7 +540,7 @@ def _formation_table(formations: Sequence[FormationCheck]) -> FactTable:
             row |= {"rigidity": "rigid", "index": ends.index, "condition": ends.condition}
         elif ends is not None:
             row["rigidity"] = f"flexible to first order, at least {ends.free} free motions"
-        elif f.method != "dense" or f.skipped:
+        elif f.solve != "dense" or f.skipped:
             row["rigidity"] = f"{'skipped' if f.skipped else 'too large'}, rigidity not checked"
         else:
             row["rigidity"] = (
@@ -601,8 +560,8 @@ def _graph_table(formations: Sequence[FormationCheck]) -> FactTable:
     rows = []
     for f in formations:
         row: dict[str, Any] = {"graph": f.name}
-        if f.method != "dense":
-            row["solved by"] = solvers.WORDS[f.method]
+        if f.solve != "dense":
+            row["solved by"] = solvers.WORDS[f.solve]
         if (r := f.rigidity) is not None:
             if r.reachable < r.needed:
                 row["reachable rank"] = r.reachable
@@ -637,5 +596,5 @@ def names_in_words(names: Sequence[str]) -> str:
     return f"{text} {'is' if len(names) == 1 else 'are'}"
 
 
-def _by_name(names: tuple[str, ...], values: tuple[Any, ...] | None) -> dict[str, Any] | None:
-    return None if values is None else dict(zip(names, values, strict=False))
+def _by_name(names: str, values: Sequence[Any] | None) -> dict[str, Any] | None:
+    return None if values is None else dict(zip(names.split(), values, strict=False))

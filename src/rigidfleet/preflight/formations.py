@@ -62,8 +62,8 @@ def check_formations(
         work = _work_time(mission, name, search=search)
         skipped = k > 1 and work > left
         left -= 0.0 if skipped else work
-        check = _first_check(mission, name, held[name], skipped=skipped)
-        checks[name] = check if skipped else _check_rigidity(mission, check, search=search)
+        check = _check_formation(mission, name, held[name], search=search, skipped=skipped)
+        checks[name] = check
     return [checks[name] for name in mission.formations]
 
 
@@ -75,27 +75,26 @@ def _work_time(mission: Mission, name: str, *, search: bool) -> float:
     return 0.1 * search + 5e-10 * min(m, 3 * n) ** 2 * max(m, 3 * n) + 2e-3
 
 
-def _first_check(mission: Mission, name: str, held: _Held, *, skipped: bool) -> FormationCheck:
-    """What needs no decomposition: the method, the spacing of the slots, and the lights."""
+def _check_formation(
+    mission: Mission, name: str, held: _Held, *, search: bool, skipped: bool
+) -> FormationCheck:
+    """The rigidity, or the spectrum of a large formation, and other shapes if they are searched.
+
+    Of a formation that is ``skipped``, what needs no decomposition: the solve, the spacing of the slots, the lights.
+    """
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
     spacing = math.inf if slots is None or len(slots) < 2 else float(nearest(slots).min())
-    return FormationCheck(
+    check = FormationCheck(
         name, None, held,
-        method=solvers.choose_method(mission.n_agents, edges, mission.constraint.solver), skipped=skipped,
-        spacing=spacing, colours=len({*(mission.formation_colours(name) or ())}),
+        solve=solvers.choose_method(mission.n_agents, edges, mission.constraint.solver), skipped=skipped,
+        spacing_m=spacing, colours=len({*(mission.formation_colours(name) or ())}),
     )  # fmt: skip
-
-
-def _check_rigidity(mission: Mission, check: FormationCheck, *, search: bool) -> FormationCheck:
-    """The check with the rigidity, or the spectrum of a large formation, and other shapes if they are searched."""
-    name = check.name
-    slots, edges = mission.formation_slots(name), mission.formation_edges(name)
-    if slots is None or not len(edges):
+    if skipped or slots is None or not len(edges):
         return check
     masses, space = mission.agents.mass, mission.formations[name].dimension or mission.dimension
     if min(len(edges), 3 * mission.n_agents) > DENSE:
         start = _dimension_spanned(mission.fleet.position, centred(mission.fleet.velocity))
-        if check.held_by == "distances" and max(start, _dimension_spanned(slots)) == 2:
+        if held == "distances" and max(start, _dimension_spanned(slots)) == 2:
             space = 2  # which they do not leave
         points = flatten(slots, space)[0]
         ends = spectrum(points, edges, masses) if len(slots) <= LANCZOS else None
@@ -103,7 +102,7 @@ def _check_rigidity(mission: Mission, check: FormationCheck, *, search: bool) ->
     rigidity = analyse(slots, edges, masses=masses, dimension=space)
     check = replace(check, rigidity=rigidity)
     endless = rigidity.own.rigidity_class is RigidityClass.FLEXIBLE  # a continuum of other shapes
-    if not search or endless or worst_contradiction(mission, name) is not None:
+    if not search or endless or contradiction_in_words(mission, name):
         return check
     start, space = mission.agents.position, rigidity.own.space
     others = realisations(slots, edges, starts=STARTS, start=start, dimension=space)
@@ -121,16 +120,21 @@ def _held_by(mission: Mission, name: str) -> _Held:
     return "tracking" if controls == {"tracking"} else "distances"
 
 
-def worst_contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
-    """Edge whose given distance differs most from that of the slots, and this error [m]; None within tolerance."""
+def contradiction_in_words(mission: Mission, name: str) -> str:
+    """Whose given distance differs most from that of their slots, and by how much; "" within tolerance."""
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
     if slots is None or not len(edges):
-        return None
+        return ""
     lengths = mission.formation_distances(name)
     error = np.abs(distance_geometry.distances(slots, edges) - lengths)
     worst = int(error.argmax())
-    most = mission.formations[name].greatest_error(lengths.min())
-    return (worst, float(error[worst])) if error[worst] > most else None
+    if error[worst] <= mission.formations[name].greatest_error(lengths.min()):
+        return ""
+    i, j = edges[worst] + 1
+    return (
+        f"'{name}' will have another shape than its slots: agents {i} and {j} are given {lengths[worst]:.4g} m, which"
+        f" differs from that of their slots by {error[worst]:.3g} m"
+    )
 
 
 def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Iterator[Remark]:
@@ -152,13 +156,8 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         if f.held_by == "nothing":
             continue
         alone = f.held_by == "distances"
-        if (off := worst_contradiction(mission, f.name)) is not None:
-            i, j = mission.formation_edges(f.name)[off[0]] + 1
-            length = mission.formation_distances(f.name)[off[0]]
-            yield _fails(
-                f"'{f.name}' will have another shape than its slots: agents {i} and {j} are given {length:.4g} m,"
-                f" which differs from that of their slots by {off[1]:.3g} m"
-            )
+        if words := contradiction_in_words(mission, f.name):
+            yield _fails(words)
         r = f.rigidity
         if f.spectrum is not None:
             if f.spectrum.free:

@@ -16,22 +16,15 @@ from rigidfleet.preflight.findings import FormationCheck, GainsCheck, Preflight,
 def check_gains(mission: Mission, formations: list[FormationCheck]) -> GainsCheck:
     """Stability, settling time and overshoot of the constraint law, and its force per error of a distance."""
     c = mission.constraint
-    stabilised = c.stabilisation == "pid"
-    alpha, beta, gamma = (c.alpha, c.beta, c.gamma) if stabilised else (0.0, 0.0, 0.0)
-    settling = over = None
-    if stabilised:
-        try:
-            settling = pid.settling_time(alpha, beta, gamma)
-            over = pid.overshoot(alpha, beta, gamma)
-        except ValueError:
-            pass  # more than a thousand oscillations: `gain_remarks` reports it
-    mass = float(np.mean(mission.agents.mass))
+    stabilised, settling = c.stabilisation == "pid", c.settling_time
+    over = None if settling is None else pid.overshoot(c.alpha, c.beta, c.gamma)
+    mass, stiffness = float(np.mean(mission.agents.mass)), c.beta**2 * stabilised
     force = {
-        f.name: f.rigidity.force(beta**2, mass)
+        f.name: f.rigidity.force(stiffness, mass)
         for f in formations
         if f.rigidity is not None and f.rigidity.rank
     }
-    margin = 2 * alpha * beta**2 / gamma if gamma > 0 else math.inf
+    margin = 2 * c.alpha * c.beta**2 / c.gamma if stabilised and c.gamma > 0 else math.inf
     return GainsCheck(stabilised, margin, settling, over, force)
 
 
@@ -42,12 +35,12 @@ def gain_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         return
     if not g.stabilised:
         yield from _drift(mission)
-    elif g.settling_time is None:
+    elif g.settling_time_s is None:
         yield Remark(
             "note", "gains", "errors oscillate for more than a thousand cycles: raise alpha"
         )
-    elif g.settling_time > max(b - a for a, b in phase_spans(mission)):
-        text = f"errors of distances need {g.settling_time:.3g} s to settle, longer than any phase"
+    elif g.settling_time_s > max(b - a for a, b in phase_spans(mission)):
+        text = f"errors of edges need {g.settling_time_s:.3g} s to settle, longer than any phase"
         yield Remark("note", "gains", text)
 
 

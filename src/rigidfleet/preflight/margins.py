@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,8 @@ SHAPES = 7
 _PHASE, _GAIN = math.radians(30.0), 2.0
 #: Maximum work on margins: sum of the cubes of the sizes of loops, some seconds.
 _WORK = 20_000
+#: Margins of nothing.
+_UNBOUNDED = FormationMargins(Margins(True, (0.0, math.inf), math.pi, math.inf), math.inf)
 
 
 def check_margins(
@@ -46,16 +48,17 @@ def check_margins(
     tracking = tracking_law(mission, lags)
     laws, skipped = formation_laws(mission, way, lags)
     by_place: dict[str, FormationMargins] = {}
-    for law in laws:
-        by_place[law.where] = _smaller_margins(
-            by_place.get(law.where), law.loops, law.law, law.growth
-        )
+    for where, loops, law, growth in laws:
+        known, pole = by_place.get(where, _UNBOUNDED)
+        now = known.smaller_margins(margins(loops, law, growth))
+        if constrained := [loop for loop in loops if loop.is_constrained]:
+            pole = largest_pole(constrained, law, pole, growth)
+        by_place[where] = FormationMargins(now, pole)
     alone = None if tracking is None else margins(tracking.loops, tracking.law)
     return MarginsCheck(alone, by_place, skipped)
 
 
-@dataclass(frozen=True)
-class ClosedLoops:
+class ClosedLoops(NamedTuple):
     """Loops of one shape, or of single vehicles, and the law that closes them.
 
     Attributes
@@ -95,7 +98,7 @@ def formation_laws(
         # On a way that ends, slow growth does no harm: weak shapes pass.
         growth = 1.0 / np.ptp(planned.time) if _changes_shape(planned) else GROWTH
         for r in _sampled_shapes(planned, phase):
-            key = (_place_in_words(planned), law, *_shape_key(r))
+            key = (_place_in_words(planned), law, _shape_key(r))
             if key in seen:
                 continue
             seen.add(key)
@@ -143,27 +146,12 @@ def _sampled_shapes(planned: PlannedPhase, phase: Phase) -> Floats:
     return planned.position[np.minimum(at, len(t) - 1)]
 
 
-def _shape_key(r: Floats) -> tuple[bytes, bytes]:
+def _shape_key(r: Floats) -> bytes:
     """What the loop depends on: all but place and heading, to a millimetre or so."""
     x = r - r.mean(axis=0)
     across = x[:, :2] @ x[:, :2].T
     size = max(float(np.linalg.norm(x, axis=1).max()), 1e-9)
-    rounded = (
-        np.round(part / scale, 3) + 0.0 for part, scale in ((across, size**2), (x[:, 2], size))
-    )
-    first, second = (part.tobytes() for part in rounded)
-    return first, second
-
-
-def _smaller_margins(
-    known: FormationMargins | None, loops: Sequence[Loop], law: LoopGains, growth: float
-) -> FormationMargins:
-    """The smaller margins of those ``known`` and those of a further shape."""
-    now = margins(loops, law, growth)
-    constrained = [loop for loop in loops if loop.is_constrained]
-    most = math.inf if known is None else known.largest_pole
-    pole = largest_pole(constrained, law, most, growth) if constrained else most
-    return FormationMargins(now if known is None else known.margins.smaller_margins(now), pole)
+    return (np.round([*across / size**2, x[:, 2] / size], 3) + 0.0).tobytes()
 
 
 def margin_remarks(preflight: Preflight) -> Iterator[Remark]:

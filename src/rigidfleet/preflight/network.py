@@ -40,8 +40,6 @@ _PERIOD, _VECTORS = 0.4, 20
 #: grow nor decay are nearly defective: their growth is wrong by the root of the accuracy, so that a rough search only
 #: says which delays are far from stable.
 _ROUGH, _FINE = (1e-3, 0.1), (1e-8, GROWTH)
-#: Losses that are tried first; the limit is then found to the hundredth.
-_LOSSES = (0.5, 0.8, 0.95)
 #: Time for which second moments move [s].
 _TIME = 12.0
 #: Growth [1/s] from which they count as unstable: more than the error of sampling.
@@ -62,8 +60,18 @@ def check_network(
     lags : of each vehicle
     """
     checks: dict[str, FormationNetwork] = {}
+    if (own := mission.network) is None:
+        return checks
+    net, every = network_of(mission), _ticks_per_law(mission)
     for name, flight, unheard in linear_flights(mission, way, lags):
-        check = _formation_network(mission, flight, unheard)
+        radio, latest = flight.radio, math.ceil((net.delay + net.jitter) / every)
+        delay, growing = last_stable_delay(flight), None
+        loss = greatest_stable_loss(flight) if radio.delay <= delay else None
+        if latest > min(radio.delay, delay) or own.burst is not None or own.loss > (loss or 0.0):
+            growing = float((sampled_growth(flight, net, every) > _GROWS).mean())
+        check = FormationNetwork(
+            flight.n / (radio.every * radio.tick), radio.tick, delay, latest, loss, own.loss, growing, unheard
+        )  # fmt: skip
         checks[name] = check.weaker_of(checks.get(name, check))
     return checks
 
@@ -91,19 +99,6 @@ def linear_flights(
         if 0 < 2 * near.sum() <= _LARGEST:
             flight = LinearFlight(slots, edges[near], mission.fleet.mass, law, radio, lags, drag)
             yield name, flight, int((~near).sum())
-
-
-def _formation_network(mission: Mission, flight: LinearFlight, unheard: int) -> FormationNetwork:
-    own, net, radio = mission.network, network_of(mission), flight.radio
-    assert own is not None
-    every = _ticks_per_law(mission)
-    latest, delay = math.ceil((net.delay + net.jitter) / every), last_stable_delay(flight)
-    loss = greatest_stable_loss(flight) if radio.delay <= delay else None
-    growing = None
-    if latest > min(radio.delay, delay) or own.burst is not None or own.loss > (loss or 0.0):
-        growing = float((sampled_growth(flight, net, every) > _GROWS).mean())
-    broadcasts = flight.n / (radio.every * radio.tick)
-    return FormationNetwork(broadcasts, radio.tick, delay, latest, loss, own.loss, growing, unheard)
 
 
 def _ticks_per_law(mission: Mission) -> int:
@@ -196,28 +191,28 @@ def mean_square_growth(
         sign = rng.integers(0, 2, (len(turn), len(kept))) * 2.0 - 1.0
         return kept * change + spread * sign * other.reshape(change.shape)
 
-    squares = _squares_flown(flight, delay, len(kept), time, arrive)
-    return growth_of(squares.reshape(len(squares), len(losses), states).mean(axis=2), time)
+    return _growth_flown(flight, delay, (len(losses), states), time, arrive)
 
 
-def _squares_flown(
+def _growth_flown(
     flight: LinearFlight,
     depth: int,
-    columns: int,
+    shape: tuple[int, int],
     time: float,
     arrivals: Arrivals,
     grip: Floats | None = None,
 ) -> Floats:
-    """Squares of errors of edges (ticks, B) in flights from random places; ``depth`` ticks of messages are kept."""
+    """Growth [1/s] of root mean squares of errors of edges, from the second to the last quarter of a time [s].
+
+    Groups (B,) of flights of a ``shape`` (B, states) begin at random places; ``depth`` ticks of messages are kept.
+    """
+    columns = math.prod(shape)
     x, places = np.zeros((flight.size, columns)), 3 * flight.n
     x[:places] = np.random.default_rng(1).normal(size=(places, columns))
     sent, ticks = np.zeros((depth, *flight.shape, columns)), round(time / flight.radio.tick)
-    return flight.fly(x, sent, ticks, flight.radio.delay, arrivals, grip)[0]
-
-
-def growth_of(squares: Floats, time: float) -> Floats:
-    """Growth [1/s] of the root of squares (ticks, ...) from the second to the last quarter of a time [s]."""
-    quarter = len(squares) // 4
+    squares, _ = flight.fly(x, sent, ticks, flight.radio.delay, arrivals, grip)
+    squares = squares.reshape(ticks, *shape).mean(axis=2)
+    quarter = ticks // 4
     before, after = squares[quarter : 2 * quarter], squares[-quarter:]
     return 0.5 * np.log(after.mean(axis=0) / before.mean(axis=0)) / (0.5 * time)
 
@@ -227,18 +222,12 @@ def greatest_stable_loss(flight: LinearFlight) -> float:
     few, many, links = _STATES
     states = min(max(links // len(flight.links), few), many)
 
-    tried = np.array(_LOSSES)
-    low, high = 0.0, math.inf
-    while len(tried):
-        unstable = mean_square_growth(flight, tried, states=states) > _GROWS
-        first = int(unstable.argmax()) if unstable.any() else len(tried)
-        low = float(tried[first - 1]) if first else low
-        high = float(tried[first]) if unstable.any() else high
-        if high == math.inf:
-            return low
-        tried = np.unique(np.round(np.linspace(low, high, 6), 2))
-        tried = tried[(tried > low) & (tried < high)]
-    return low
+    stable = 0
+    for step in (10, 1):  # in hundredths
+        tried = np.arange(stable + step, stable + 10 * step, step)
+        grows = mean_square_growth(flight, tried / 100, states=states) > _GROWS
+        stable += step * int(np.append(grows, True).argmax())
+    return stable / 100
 
 
 def sampled_growth(flight: LinearFlight, net: Links, every: int) -> Floats:
@@ -267,7 +256,7 @@ def sampled_growth(flight: LinearFlight, net: Links, every: int) -> Floats:
         np.clip(grip + change, 0.0, 1.0, out=grip)
         return total
 
-    return growth_of(_squares_flown(flight, delay + late, _FLIGHTS, _TIME, arrive, grip), _TIME)
+    return _growth_flown(flight, delay + late, (_FLIGHTS, 1), _TIME, arrive, grip)
 
 
 def network_remarks(preflight: Preflight) -> Iterator[Remark]:
@@ -279,15 +268,15 @@ def network_remarks(preflight: Preflight) -> Iterator[Remark]:
             text = f"'{name}': not checked over its network: it has no slots, no edge in range, or too many edges"
             yield Remark("note", "network", text)
     for name, f in preflight.network.items():
-        if f.unheard:
-            text = f"'{name}': {f.unheard} edges are longer than the range of the network: nobody hears along them"
+        if far := f.unheard_edges:
+            text = f"'{name}': {far} edges are longer than the range of the network: nobody hears along them"
             yield Remark("note", "network", text)
         if f.bears_network:
             continue
         share, what = f.growing or 0.0, f"{100 * f.own_loss:.0f} % of its messages are lost"
         why, remedy = what, "lower network.loss, raise network.rate, or slow the constraint law"
-        if f.own_delay > f.delay:
-            why = f"its messages are up to {f.own_delay} ticks late, and it bears {f.delay}"
+        if f.own_delay_ticks > f.delay_ticks:
+            why = f"its messages are up to {f.own_delay_ticks} ticks late, and it bears {f.delay_ticks}"
             remedy = "shorten network.delay, or slow the constraint law"
         grows = f"errors grow in {100 * share:.0f} % of linear flights"
         text = f"'{name}': unstable over its network: {why}; {grows}; {remedy}"

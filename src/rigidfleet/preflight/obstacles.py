@@ -17,10 +17,8 @@ from rigidfleet.preflight.findings import SLACK, Preflight, Remark, names_in_wor
 from rigidfleet.solids.records import extent
 from rigidfleet.typing import Floats
 
-#: Maximum number of comparisons of agent positions with obstacles.
-_HELD = 40_000_000
-#: Maximum number of comparisons of phases with obstacles.
-_MET = 50_000
+#: Maximum number of comparisons of agent positions with obstacles; one of a phase with an obstacle counts as so many.
+_COMPARED, _EACH = 40_000_000, 800
 #: Maximum number of comparisons of samples with boxes, to find gaps.
 _PASSED = 100_000_000
 #: Maximum number of obstacles whose clearance is reported; the nearest ones.
@@ -38,12 +36,11 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
     )
     bounds = [_distance_bound(within, thing) for thing in mission.obstacles]
     far = np.stack(bounds, axis=1) - radius.max()
-    held, met, skipped = 0, 0, []
+    compared, skipped = 0, []
     unproved: dict[int, float] = {}
     paces = [speed_bounds(planned) for planned in way]
     near = np.argsort(far.min(axis=0), kind="stable")
-    shown: dict[int, tuple[float, float, int, str]] = {}
-    remarks: dict[int, list[Remark]] = {}
+    shown: dict[int, dict[bool, tuple[float, float, int, str]]] = {}
     for rank, b in enumerate(near.tolist()):
         thing = mission.obstacles[b]
         if rank >= _NEAREST and far[:, b].min() > 0:
@@ -53,8 +50,8 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             planned = way[k]
             if far[k, b] >= worst.get(planned.exact, (np.inf,))[0]:
                 continue
-            held, met = held + planned.position[:, :, 0].size, met + 1
-            if held > _HELD or met > _MET:
+            compared += planned.position[:, :, 0].size + _EACH
+            if compared > _COMPARED:
                 break
             clearance, agent, time, proved = closest(planned, thing, radius, paces[k])
             if clearance - proved > max(unproved.get(b, 0.0), 1.5 * CLOSE):
@@ -62,27 +59,25 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             # Among equal minima, take the first one: ignore rounding and the last millimetre of a rest.
             if clearance < worst.get(planned.exact, (np.inf,))[0] - CLOSE:
                 worst[planned.exact] = (clearance, time, agent, planned.phase)
-        if held > _HELD or met > _MET:
+        if compared > _COMPARED:
             skipped = near[rank:][far[:, near[rank:]].min(axis=0) <= 0].tolist()
             break
         if worst:
-            shown[b] = min(worst.values())
-        for exact, (clearance, t, i, phase) in worst.items():
-            if clearance < -1e-6:  # a vehicle that stands is in contact
-                verb = "hits" if exact else "may hit"
-                text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s in '{phase}'"
-                if isinstance(thing, Ground):
-                    text += _too_low(mission, preflight, phase, thing.height)
-                evaded = thing.solid.moves and is_left_to_avoidance(mission, "obstacle")
-                if evaded:
-                    text += " as planned; [avoidance] has to evade it"
-                remark = Remark("fails" if exact and not evaded else "note", "obstacle", text)
-                remarks.setdefault(b, []).append(remark)
+            shown[b] = worst
     for b in sorted(shown):
-        clearance, t, i, _ = shown[b]
-        preflight.clearance.append((mission.obstacles[b].name, clearance, t, f"agent {i + 1}"))
-    for b in sorted(remarks):
-        yield from remarks[b]
+        thing, (clearance, t, i, _) = mission.obstacles[b], min(shown[b].values())
+        preflight.clearance.append((thing.name, clearance, t, f"agent {i + 1}"))
+        for exact, (clearance, t, i, phase) in shown[b].items():
+            if clearance >= -1e-6:  # a vehicle that stands is in contact
+                continue
+            verb = "hits" if exact else "may hit"
+            text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s in '{phase}'"
+            if isinstance(thing, Ground):
+                text += _too_low(mission, preflight, phase, thing.height)
+            evaded = thing.solid.moves and is_left_to_avoidance(mission, "obstacle")
+            if evaded:
+                text += " as planned; [avoidance] has to evade it"
+            yield Remark("fails" if exact and not evaded else "note", "obstacle", text)
     if unproved:
         names = [mission.obstacles[b].name for b in sorted(unproved)]
         text = (
@@ -166,10 +161,7 @@ def _gaps(mission: Mission, preflight: Preflight, radius: Floats) -> Iterator[Re
         cm = np.einsum("i,kia->ka", masses, planned.position) / masses.sum()
         between = (cm[:, None] > low) & (cm[:, None] < high)
         for axis in range(3):
-            rest = [k for k in range(3) if k != axis]
-            beside = between[:, :, rest].all(axis=2)
-            if not beside.any():
-                continue
+            beside = np.delete(between, axis, axis=2).all(axis=2)
             at = cm[:, axis, None]
             below = np.where(beside & (high[:, axis] < at), high[:, axis], -np.inf)
             above = np.where(beside & (low[:, axis] > at), low[:, axis], np.inf)

@@ -113,7 +113,9 @@ def offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     remarks: dict[tuple[str, bool], Remark] = {}
     gusts = 0.0 if preflight.disturbed is None else preflight.disturbed.gusts
     gusts *= 2.0 / 3.0 / (mission.tracking_gains[0] * float(mission.fleet.mass.min()))
-    way = preflight.planned_phases
+    way, remedy = preflight.planned_phases, ""
+    if not mission.tracking.integral:
+        remedy = f"; tracking has no integral: raise the first weight in tracking.Q (now {mission.tracking.Q[0]:g})"
     for planned, off in zip(way, offsets(mission, way), strict=True):
         far = float(np.linalg.norm(off, axis=2).max())
         if planned.leg.end > mission.first_loss or far < _LEAST:
@@ -126,7 +128,7 @@ def offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
             evaded = is_left_to_avoidance(mission, topic, mission.limits.separation or 0.0)
             fails = planned.exact and topic in surely and not evaded
             text = f"steady disturbances push vehicles up to {far:.2g} m off their slots in '{planned.phase}'"
-            remark = Remark("fails" if fails else "note", topic, f"{text}: {now[topic]}")
+            remark = Remark("fails" if fails else "note", topic, f"{text}: {now[topic]}{remedy}")
             remarks.setdefault((topic, fails), remark)
     yield from remarks.values()
 

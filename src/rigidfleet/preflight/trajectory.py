@@ -7,7 +7,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigidfleet._common.quantities import MOTIONS
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.formation import distance_geometry
@@ -30,6 +29,8 @@ from rigidfleet.typing import Floats
 
 #: Share by which a goal is planned to be missed by more than its tolerance, before it is said to be missed.
 _CLEARLY = 0.02
+#: Separation of two agents [m], when [s], and which, from 0.
+_Nearest = tuple[float, float, tuple[int, ...]]
 
 
 def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -38,10 +39,10 @@ def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         return
     radius, limit = mission.fleet.radius, mission.limits.separation or 0.0
     lowest = mission.limits.separation_altitude
-    worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
-    least = np.inf, 0.0, (0, 0)
+    worst: dict[bool, tuple[_Nearest, str]] = {}
+    least: _Nearest = np.inf, 0.0, (0, 0)
     for number, planned in enumerate(preflight.planned_phases):
-        ends: list[tuple[float, float, tuple[int, ...]]] = []
+        ends: list[_Nearest] = []
         positions = planned.position if planned.path_ends is None else np.array(planned.path_ends)
         # Where separation begins at an altitude, agents below it are left to the verdict.
         flying = positions[..., 2] >= (-np.inf if lowest is None else lowest)
@@ -58,23 +59,30 @@ def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
             least = min(least, crossing)
             beyond = flying.all() and (separation <= 0 or separation < limit - SLACK)
             if beyond and separation < min(ends)[0] - SLACK:
-                yield _crossing_remark(mission, planned, crossing, limit)
+                yield _crossing_remark(mission, planned, crossing)
         for k, at in enumerate(ends):
             least = min(least, at)
             # The start positions are known even if the path from there is not.
             exact = planned.exact or (number == 0 and k == 0 and planned.path_ends is not None)
-            if exact not in worst or at[0] < worst[exact][0]:
-                worst[exact] = *at, planned.phase
+            if exact not in worst or at[0] < worst[exact][0][0]:
+                worst[exact] = at, planned.phase
     if np.isfinite(least[0]):
         preflight.separation = least[0], least[1], agent_names(least[2])
-    for exact, (separation, t, who, phase) in worst.items():
-        if separation <= 0 or separation < limit - SLACK:
-            text = _nearness_in_words(who, separation, t, phase, limit, exact=exact)
-            yield _collision_remark(mission, text, limit, exact=exact)
+    for exact, (at, phase) in worst.items():
+        if at[0] <= 0 or at[0] < limit - SLACK:
+            yield _collision_remark(mission, at, phase, exact=exact)
 
 
-def _collision_remark(mission: Mission, text: str, limit: float, *, exact: bool) -> Remark:
+def _collision_remark(
+    mission: Mission, at: _Nearest, phase: str, why: str = "", *, exact: bool
+) -> Remark:
     """Remark on planned paths that come too close, which is a note where the guard of [avoidance] keeps the limit."""
+    (separation, t, who), limit = at, mission.limits.separation or 0.0
+    text = f"a separation of {separation:.2f} m at {t:.2f} s in '{phase}' (limit {limit:g} m)"
+    text = f"{agent_names(who)} have {text}{why}"
+    if separation <= 0:
+        may = "" if exact else "may "
+        text = f"{agent_names(who)} {may}collide at {t:.2f} s in '{phase}'{why}"
     if not exact:
         text += "; straight paths are assumed, as only distances guide the agents"
     elif is_left_to_avoidance(mission, "collision", limit):
@@ -82,40 +90,26 @@ def _collision_remark(mission: Mission, text: str, limit: float, *, exact: bool)
     return Remark("fails" if exact else "note", "collision", text)
 
 
-def _nearness_in_words(
-    who: tuple[int, ...], separation: float, t: float, phase: str, limit: float, *, exact: bool
-) -> str:
-    if separation <= 0:
-        return f"{agent_names(who)} {'' if exact else 'may '}collide at {t:.2f} s in '{phase}'"
-    return f"{agent_names(who)} have a separation of {separation:.2f} m at {t:.2f} s in '{phase}' (limit {limit:g} m)"
-
-
-def _crossing_remark(
-    mission: Mission,
-    planned: PlannedPhase,
-    at: tuple[float, float, tuple[int, ...]],
-    limit: float,
-) -> Remark:
+def _crossing_remark(mission: Mission, planned: PlannedPhase, at: _Nearest) -> Remark:
     """Remark on agents whose straight paths from one formation to the next come too close."""
-    (separation, t, who), (before, after) = at, planned.shapes
-    needed = sum(mission.agents.radius[i] for i in who) + limit
+    (separation, _, who), (before, after) = at, planned.shapes
+    radii = sum(mission.agents.radius[i] for i in who)
+    needed = radii + (mission.limits.separation or 0.0)
     origin = "the start" if before is None else f"'{before}'"
-    text = (
-        f"{_nearness_in_words(who, separation, t, planned.phase, limit, exact=planned.exact)}: their paths from"
-        f" {origin} to '{after}' cross with {max(0.0, separation + needed - limit):.2f} m from centre to centre. "
-    )
+    apart = f"{max(0.0, separation + radii):.2f} m from centre to centre"
+    text = f": their paths from {origin} to '{after}' cross with {apart}. "
     assert after is not None  # the phase changes the formation
     assert planned.path_ends is not None
-    apart = min(float(proximity.nearest(places).min()) for places in planned.path_ends)
-    spaced = f"place slots at least {math.sqrt(2) * needed:.2f} m apart (now {apart:.2f} m)"
+    least = min(float(proximity.nearest(places).min()) for places in planned.path_ends)
+    spaced = f"place slots at least {math.sqrt(2) * needed:.2f} m apart (now {least:.2f} m)"
     promised = mission.assigned_turn(before, after) is not None
     if promised:
         text += f"{spaced[0].upper()}{spaced[1:]}"
     else:
         text += 'Assign agents to near slots: assignment = "each"'
-    if not promised and apart < math.sqrt(2) * needed:
+    if not promised and least < math.sqrt(2) * needed:
         text += f"; and {spaced}"
-    return _collision_remark(mission, text, limit, exact=planned.exact)
+    return _collision_remark(mission, at, planned.phase, text, exact=planned.exact)
 
 
 def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -138,33 +132,28 @@ def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             yield Remark("fails" if exact else "note", "downwash", text)
 
 
-def thrust_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
-    """Remarks on planned thrust beyond a limit."""
-    masses, limits = mission.fleet.mass, mission.fleet.thrust_limit
-    weight, way = np.array([0.0, 0.0, mission.gravity]), preflight.planned_phases
-    if way:
-        needs = [masses * np.linalg.norm(planned.acceleration + weight, axis=2) for planned in way]
-        preflight.thrust, planned = _nearest_to_limit(way, needs, limits)
-        force, t, who, limit = preflight.thrust
-        smooth = mission.smooth and planned.exact  # judged with the other limits of the plan
-        if force > limit * (1 + 1e-3) and not smooth:
-            text = f"{who} needs {force:.1f} N at {t:.2f} s in '{planned.phase}'"
-            text += f" (limit {limit:g} N)"
-            yield Remark("fails" if planned.exact else "note", "thrust", text)
-    yield from _step_thrust(mission, preflight)
-
-
 def _nearest_to_limit(
     way: list[PlannedPhase], needs: list[Floats], limits: Floats
-) -> tuple[tuple[float, float, str, float], PlannedPhase]:
+) -> tuple[float, float, str, float]:
     """Of the forces (K, N) [N] of each phase, the one nearest to its limit (N,) [N], or the greatest if there is none.
 
-    Its value, time [s], agent and limit, and its phase.
+    Its value, time [s], agent and limit.
     """
     room = limits if np.isfinite(limits).any() else 0.0
     planned, need = max(zip(way, needs, strict=True), key=lambda pair: (pair[1] - room).max())
     k, i = np.unravel_index(int((need - room).argmax()), need.shape)
-    return (float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])), planned
+    return float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])
+
+
+def greatest_thrust(
+    mission: Mission, way: list[PlannedPhase]
+) -> tuple[float, float, str, float] | None:
+    """The planned thrust [N] that is nearest to its limit, its time [s], agent and limit [N]; None without a plan."""
+    if not way:
+        return None
+    mass, weight = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
+    needs = [mass * np.linalg.norm(planned.acceleration + weight, axis=2) for planned in way]
+    return _nearest_to_limit(way, needs, mission.fleet.thrust_limit)
 
 
 def greatest_speed(way: list[PlannedPhase], axes: slice) -> tuple[float, float, str] | None:
@@ -172,8 +161,7 @@ def greatest_speed(way: list[PlannedPhase], axes: slice) -> tuple[float, float, 
     if not way:
         return None
     sizes = [np.linalg.norm(planned.velocity[..., axes], axis=2) for planned in way]
-    (speed, t, who, _), _ = _nearest_to_limit(way, sizes, np.full(sizes[0].shape[1], np.inf))
-    return speed, t, who
+    return _nearest_to_limit(way, sizes, np.full(sizes[0].shape[1], np.inf))[:3]
 
 
 def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -195,7 +183,7 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
         force = true[:, None] * (planned.acceleration + g * up)
         force -= drag[:, None] * (wind - planned.velocity)
         needs.append(np.linalg.norm(force, axis=2) + gusts + noise)
-    most, _ = _nearest_to_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
+    most = _nearest_to_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
     steady = air_force(mission, np.tile(wind, (len(drag), 1)))
     steady -= ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
@@ -210,23 +198,12 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
     if most[0] > most[3]:
         text = f"with disturbances, {most[2]} may need {most[0]:.1f} N at {most[1]:.2f} s (limit {most[3]:g} N)"
         yield Remark("note", "thrust", text)
-    if off[far] > WAYPOINT_TOLERANCE["position"] and any(
-        phase.control == "tracking" for phase in mission.phases
-    ):
-        text = (
-            f"steady disturbances hold agent {far + 1} {off[far]:.2f} m off its slot, because tracking has no integral;"
-            f" a larger first weight in tracking.Q reduces the offset (now {mission.tracking.Q[0]:g})"
-            + ("" if mission.vehicle_models is None else ", and tracking.integral removes it")
-        )
-        yield Remark("note", "disturbances", text)
     if lost:
-        text = (
-            f"paths are checked as if {agent_names(tuple(i for i, _ in lost))} flew on to the end"
-        )
+        text = f"paths are checked as if {agent_names(i for i, _ in lost)} flew on to the end"
         yield Remark("note", "disturbances", text)
 
 
-def _step_thrust(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
+def step_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on the forces at a step of the reference: J M^-1 J^T lambda = -beta^2 c."""
     c, masses = mission.constraint, mission.fleet.mass
     if c.stabilisation == "none":
@@ -241,9 +218,8 @@ def _step_thrust(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         edges = mission.formation_edges(shaping.formation)
         if min(len(edges), 3 * mission.n_agents) > DENSE:
             continue
-        error = distance_geometry.distances(r, edges) - mission.formation_distances(
-            shaping.formation
-        )
+        lengths = mission.formation_distances(shaping.formation)
+        error = distance_geometry.distances(r, edges) - lengths
         J = jacobian(r, edges)
         root = np.repeat(1 / np.sqrt(masses), 3)
         f = np.linalg.lstsq(J * root, -(c.beta**2) * error, rcond=1e-7)[0] / root
@@ -281,28 +257,20 @@ def waypoint_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             turns = ("attitude", turn), ("rates", spin)
             meets |= {what: math.degrees(np.linalg.norm(x)) for what, x in turns}
         for what, off in meets.items():
-            if off > (1.0 + _CLEARLY) * WAYPOINT_TOLERANCE[what]:
-                yield _miss_remark(mission, planned, what, off, exact=exact)
-
-
-def _miss_remark(
-    mission: Mission, planned: PlannedPhase, what: str, off: float, *, exact: bool
-) -> Remark:
-    """Remark on a goal that is missed by this much in position, velocity, attitude or rates."""
-    turns = what in ("attitude", "rates")
-    law, table = (mission.lqr.attitude, "lqr.attitude") if turns else (mission.lqr, "lqr")
-    remedy = f"greater weights {table}.S"
-    if law.horizon == "infinite":
-        remedy = f"greater weights {table}.Q, or horizon = 'finite'"
-    # Of a body under feedback, the rotation is planned as one about a fixed axis.
-    sure = exact and (planned.leg.phase.control == "tracking" or not turns)
-    return Remark(
-        "fails" if sure else "note",
-        "waypoint",
-        f"the waypoint of '{planned.phase}' {'is' if sure else 'may be'} missed, {off:.2g} {UNITS[what]} off in {what}"
-        f" at {planned.leg.arrival:.2f} s (limit {WAYPOINT_TOLERANCE[what]:g} {UNITS[what]}): give the phase more"
-        f" time, or {remedy}",
-    )
+            unit, most = UNITS[what], WAYPOINT_TOLERANCE[what]
+            if off <= (1.0 + _CLEARLY) * most:
+                continue
+            is_turn = what in ("attitude", "rates")
+            law, table = (mission.lqr.attitude, "lqr.attitude") if is_turn else (mission.lqr, "lqr")
+            remedy = f"greater weights {table}.S"
+            if law.horizon == "infinite":
+                remedy = f"greater weights {table}.Q, or horizon = 'finite'"
+            # Of a body under feedback, the rotation is planned as one about a fixed axis.
+            sure = exact and (phase.control == "tracking" or not is_turn)
+            how = f"{'is' if sure else 'may be'} missed, {off:.2g} {unit} off in {what}"
+            text = f"the waypoint of '{planned.phase}' {how} at {leg.arrival:.2f} s"
+            text += f" (limit {most:g} {unit}): give the phase more time, or {remedy}"
+            yield Remark("fails" if sure else "note", "waypoint", text)
 
 
 def limit_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -311,7 +279,16 @@ def limit_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     for planned in preflight.planned_phases:
         phase = planned.leg.phase
         if (mission.smooth or phase.follows_curves) and phase.control == "tracking":
-            yield from _limits_of_reference(mission, planned, hopeless)
+            # The limit that its reference breaks most, with the least time that keeps all.
+            over = timing.broken_limits(mission, planned.leg)
+            if over and (topic := over[0].limit.of.name_in_words) not in hopeless:
+                key, t = timing.least_time(mission, planned.leg)
+                if t is None:
+                    hopeless.add(topic)
+                    remedy = f"no {key} of this phase keeps all limits"
+                else:
+                    remedy = f"the least {key} of this phase is {math.ceil(100 * t) / 100:.2f} s"
+                yield Remark("fails", topic, f"{timing.reached_in_words(over[0], phase)}; {remedy}")
         else:
             yield from _limits_at_samples(mission, planned)
         yield from geofence_remarks(mission, planned)
@@ -329,33 +306,17 @@ def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark
             yield Remark("fails" if planned.exact else "note", "geofence", text)
 
 
-def _limits_of_reference(
-    mission: Mission, planned: PlannedPhase, hopeless: set[str]
-) -> Iterator[Remark]:
-    """Remark on the limit that the reference of a smooth phase breaks most, with the least time that keeps all."""
-    over = timing.broken_limits(mission, planned.leg)
-    if not over or (topic := over[0].limit.of.name_in_words) in hopeless:
-        return
-    key, least = timing.least_time(mission, planned.leg)
-    if least is None:
-        remedy = f"no {key} of this phase keeps all limits"
-        hopeless.add(topic)
-    else:
-        remedy = f"the least {key} of this phase is {math.ceil(100 * least) / 100:.2f} s"
-    yield Remark("fails", topic, f"{timing.reached_in_words(over[0], planned.leg.phase)}; {remedy}")
-
-
 def _limits_at_samples(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
-    """Remarks on speed and acceleration of samples beyond their limits."""
+    """Remarks on speed, acceleration and thrust of samples beyond their limits."""
     x = np.stack([planned.position, planned.velocity, planned.acceleration], axis=1)
     for limit in limits_of(mission):
-        q, most = limit.of, float(limit.most[0])
-        if q not in MOTIONS or q.order > 2:
+        q = limit.of
+        if q.order > 2 or q.name == "tilt":
             continue
         size = limit.values(x, np.arange(mission.n_agents))
         of = f" of {q.name_in_words}" if q.way else ""
-        k, i = np.unravel_index(int(size.argmax()), size.shape)
-        if size[k, i] > most * (1 + 1e-3):
+        k, i = np.unravel_index(int((size / limit.most).argmax()), size.shape)
+        if size[k, i] > (most := limit.most[i]) * (1 + 1e-3):
             text = (
                 f"agent {i + 1} reaches {size[k, i]:.3g} {q.unit}{of} at {planned.time[k]:.2f} s in"
                 f" '{planned.phase}' (limit {most:g} {q.unit})"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
@@ -61,27 +60,21 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
             if not model.point:
                 need = _needs_of_path(model, x[:, :, i], yaw[:, :, i], mission.gravity)
                 needs.append(_needs_of_phase(model, need, time, f"agent {i + 1}", planned.phase))
-    force = max((asks.force for asks in needs), key=lambda force: force[0] / force[3])
-    tilt = max((asks.tilt for asks in needs), key=lambda tilt: tilt[0])
-    beyond = max((asks.beyond for asks in needs), key=lambda beyond: beyond[0])
+    jump = _greatest_jump(mission, tracked)
     return VehicleCheck(
-        force, tilt, _greatest_jump(mission, tracked), beyond if beyond[0] > 0.0 else None
+        rotor_force=max((x.rotor_force for x in needs), key=lambda force: force[0] / force[3]),
+        tilt=max((x.tilt for x in needs), key=lambda tilt: tilt[0]),
+        jump=jump,
+        beyond=max((x.beyond for x in needs if x.beyond), key=lambda y: y[0], default=None),
     )
 
 
-class _Needs(NamedTuple):
-    """What a phase asks of one vehicle, as in `VehicleCheck`."""
-
-    force: tuple[float, float, str, float, str]
-    tilt: tuple[float, float, str, str]
-    beyond: tuple[float, str, str, str]
-
-
-def _needs_of_phase(model: VehicleModel, need: Flat, time: Floats, who: str, phase: str) -> _Needs:
-    rotor = need.rotor_forces(
-        np.array(model.inertia),
-        mixing(model.arm, model.torque_coefficient / model.thrust_coefficient),
-    )
+def _needs_of_phase(
+    model: VehicleModel, need: Flat, time: Floats, who: str, phase: str
+) -> VehicleCheck:
+    """What a phase asks of one vehicle."""
+    mixed = mixing(model.arm, model.torque_coefficient / model.thrust_coefficient)
+    rotor = need.rotor_forces(np.array(model.inertia), mixed)
     tilt = np.degrees(need.tilt)
     least, most = (model.thrust_coefficient * speed**2 for speed in model.rotor_speed)
     k, j = int(rotor.max(axis=1).argmax()), int(tilt.argmax())
@@ -93,10 +86,11 @@ def _needs_of_phase(model: VehicleModel, need: Flat, time: Floats, who: str, pha
         if aslant.sum() > weak.sum()
         else f"rotor forces of {rotor.min():.3g} to {rotor.max():.3g} N (rotors give {least:.3g} to {most:.3g} N)"
     )
-    return _Needs(
-        (float(rotor[k].max()), float(time[k]), who, most, phase),
-        (float(tilt[j]), float(time[j]), who, phase),
-        (float((weak | aslant).mean()), who, phase, needs),
+    share = float((weak | aslant).mean())
+    return VehicleCheck(
+        rotor_force=(float(rotor[k].max()), float(time[k]), who, most, phase),
+        tilt=(float(tilt[j]), float(time[j]), who, phase),
+        beyond=(share, who, phase, needs) if share else None,
     )
 
 
@@ -118,10 +112,8 @@ def _greatest_jump(
         if before.leg.end != after.leg.start:
             continue
         t = np.array([after.leg.start])
-        a, b = (
-            slot_derivatives(leg.reference, leg.motion, t, 3)[0, 2]
-            for leg in (before.leg, after.leg)
-        )
+        legs = before.leg, after.leg
+        a, b = (slot_derivatives(x.reference, x.motion, t, 3)[0, 2] for x in legs)
         jump = np.linalg.norm(b - a, axis=1)
         i = int(jump.argmax())
         up = np.array([0.0, 0.0, mission.gravity])

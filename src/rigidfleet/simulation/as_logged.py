@@ -17,8 +17,7 @@ from rigidfleet.assessment import Verdict, assess
 from rigidfleet.assessment.alignment import Alignment, align
 from rigidfleet.assessment.doubt import DrawnWays, doubt_facts, verdict_with_doubt
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.foreign.curves import Trajectories
-from rigidfleet.foreign.samples import ASSUMED
+from rigidfleet.foreign.curves import ASSUMED, Trajectories
 from rigidfleet.math import smoothing
 from rigidfleet.math.piecewise import Piecewise, join
 from rigidfleet.math.smoothing import NoiseEstimate, PositionNoise, Positions, Smoothed

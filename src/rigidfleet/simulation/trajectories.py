@@ -19,8 +19,7 @@ from numpy.typing import ArrayLike
 
 from rigidfleet._common.quantities import PLACES, QUANTITIES
 from rigidfleet.errors import ResultError
-from rigidfleet.foreign.curves import Trajectories
-from rigidfleet.foreign.samples import ASSUMED
+from rigidfleet.foreign.curves import ASSUMED, Trajectories
 from rigidfleet.kernel import records
 from rigidfleet.math import series
 from rigidfleet.math.bernstein import SIZES, greatest_convex_value
