@@ -5,13 +5,11 @@ Both the plan of a flight and the check before it use them. Nothing here integra
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from rigidfleet._common.arrays import arrays_equal
 from rigidfleet.formation import distance_geometry
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import attitude as att
@@ -29,34 +27,19 @@ class ByEdge:
     edges: Ints = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     values: Floats = field(default_factory=lambda: np.zeros(0))
 
-    def values_of(self, edges: Ints, other: Floats | float | Callable[[], Floats]) -> Floats:
-        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges, or (B, m), then of so many flights.
-
-        A function of ``other`` values is called only where edges may be new.
-        """
-        if self._has(edges) and not (isinstance(other, np.ndarray) and other.ndim > 1):
-            return self.values.copy()
-        new = other if isinstance(other, np.ndarray | float | int) else other()
-        if not len(self.edges):
-            return np.zeros(len(edges)) + new
+    def values_of(self, edges: Ints, other: Floats | float) -> Floats:
+        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges, or (B, m), then of so many flights."""
         keys, own = _keys(edges), _keys(self.edges)
         order = np.argsort(own)
-        at = np.searchsorted(own, keys, sorter=order)
-        at = np.append(order, len(order))[at]
+        at = np.append(order, len(order))[np.searchsorted(own, keys, sorter=order)]
         known = np.append(own, -1)[at] == keys
-        return np.where(known, np.append(self.values, 0.0)[at], new)
+        return np.where(known, np.append(self.values, 0.0)[at], other)
 
     def with_values(self, edges: Ints, values: Floats) -> ByEdge:
         """These values, updated with the ``values`` of edges (m, 2), i < j."""
-        if not len(self.edges) or self._has(edges):
-            return ByEdge(edges, values.copy())
         edges = np.concatenate([edges, self.edges])
         first = np.unique(_keys(edges), return_index=True)[1]
         return ByEdge(edges[first], np.concatenate([values, self.values])[first])
-
-    def _has(self, edges: Ints) -> bool:
-        """Whether these are its edges, in the same order: most phases have those of the phase before."""
-        return arrays_equal(edges, self.edges)
 
 
 def _keys(edges: Ints) -> Ints:
