@@ -213,18 +213,13 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
     return Course(goal, arrival, lambda: motion, lift)
 
 
-def course_conflict(phase: Phase, now: PhaseState) -> str:
+def course_conflict(phase: Any, now: PhaseState) -> str:
     """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
-    return _MISMATCHES.get(phase.kind, lambda *_: "")(phase, now)
-
-
-def _slot_mismatch(phase: Reshape, now: PhaseState) -> str:
-    """What keeps a change of shape from following its bent ways, if it has any."""
     if phase.bent:
         first = np.array(phase.control_points)[0]
         if now.slots is None or not np.abs(first - now.slots).max() < _START_TOLERANCES[0]:
             return "begins in other slots than the phase before has led to"
-    return ""
+    return _vehicle_mismatch(phase, now) if phase.follows_curves else ""
 
 
 def _vehicle_mismatch(phase: Follow, now: PhaseState) -> str:
@@ -344,9 +339,4 @@ _COURSES: dict[str, Callable[[Mission, Any, PhaseState, float], Course]] = {
     "reshape": _reshape,
     "takeoff": _vertical,
     "turn": _turn,
-}
-#: Function of each kind of phase that may follow given ways, which says what keeps it from that.
-_MISMATCHES: dict[str, Callable[[Any, PhaseState], str]] = {
-    "follow": _vehicle_mismatch,
-    "reshape": _slot_mismatch,
 }

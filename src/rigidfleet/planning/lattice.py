@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -225,22 +225,15 @@ class Roadmap:
 
     def __init__(
         self, space: FreeSpace, layers: list[Layer], changes: list[Change], radius: Floats, need: float,
-        frames: list[Floats], common: list[list[Floats]], known: dict[Any, Lattice],
+        frames: list[Floats], common: list[list[Floats]],
     ) -> None:  # fmt: skip
-        """Build the lattices; the parameters are those of `Lattice`, for each layer and frame.
-
-        ``known`` has the lattices of networks before, in the same space and of the same need, and gets the new ones.
-        """
+        """Build the lattices; the parameters are those of `Lattice`, for each layer and frame."""
         self.space, self.layers, self.changes = space, layers, changes
         self.radius, self.need = radius, need
-        every = [
-            [(f, layer.formation, layer.angles) for layer in layers] for f in range(len(frames))
+        self.lattices = [
+            [Lattice(space, layer, radius, need, frame, even) for layer in layers]
+            for frame, even in zip(frames, common, strict=True)
         ]
-        for keys, frame, even in zip(every, frames, common, strict=True):
-            for key, layer in zip(keys, layers, strict=True):
-                if key not in known:
-                    known[key] = Lattice(space, layer, radius, need, frame, even)
-        self.lattices = [[known[key] for key in keys] for keys in every]
         counts = [[len(x.points) for x in row] for row in self.lattices]
         starts = np.cumsum([0, *np.ravel(counts)])
         self.first = starts[:-1].reshape(len(frames), len(layers))

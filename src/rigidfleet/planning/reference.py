@@ -116,11 +116,6 @@ class PhaseState:
     rates: Floats | None = None
 
 
-def nearest_rotation(before: Floats, after: Floats, masses: Floats) -> Floats:
-    """The rotation (3, 3) that brings slots (N, 3) nearest to those before: Kabsch, weighted by mass."""
-    return rigid_body.kabsch(before, after, masses)
-
-
 def reference_kind(
     mission: Mission, phase: Shaping, before: Floats, target: Floats | None
 ) -> Literal["shape", "squares", "step"]:
@@ -140,13 +135,6 @@ def reference_kind(
         return "squares"
     edges = mission.formation_edges(phase.formation)
     lengths = mission.formation_distances(phase.formation)
-    return _leading_kind(before, target, edges, lengths)
-
-
-def _leading_kind(
-    before: Floats, target: Floats, edges: Ints, lengths: Floats
-) -> Literal["shape", "squares"]:
-    """Kind of reference that leads from slots to others, whose edges have lengths (m,) [m] asked for."""
     if not np.allclose(distance_geometry.distances(target, edges), lengths, rtol=1e-3):
         return "squares"
     start, goal = rigid_body.centred(before), rigid_body.centred(target)
@@ -167,5 +155,5 @@ def align_slots(
     straight blend then has no angular momentum in its own frame, and moves the agents least. During the blend the
     slots rotate back, so that the body axes keep their meaning; distances are not affected.
     """
-    R = nearest_rotation(before, after, masses) if turn is None else turn
+    R = rigid_body.kabsch(before, after, masses) if turn is None else turn
     return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T
