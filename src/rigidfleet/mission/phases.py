@@ -367,11 +367,8 @@ def _reshape(m: Draft, p: Reshape, k: int, _: float | None) -> Breaches:
     rows, n = p.control_points, m.n
     if rows is not None and n is not None:
         if len(rows) < 4 or any(len(row) != n for row in rows):
-            problem, remedy = (
-                "is no list of four or more rows of slots",
-                f"give {n} points in each row",
-            )
-            yield Breach("control_points", problem, remedy, None)
+            problem = "is no list of four or more rows of slots"
+            yield Breach("control_points", problem, f"give {n} points in each row", None)
         elif p.transition != "straight" or p.alignment != "none" or p.control != "tracking":
             problem = "needs tracked slots, alignment = 'none' and no transition"
             remedy = "correct these keys, or use transition = 'ways'"

@@ -681,12 +681,8 @@ class Aborts:
         on = _concatenate(ways)
         before = [on.between(0.0, waits)] if waits else []
         own = _concatenate([*before, *(step.way for step in steps)])
-        knots = common_knots([own, on])
-        own, way, who = (
-            own.refine(knots, stays=True),
-            on.refine(knots, stays=True),
-            self._leavers.left,
-        )
+        knots, who = common_knots([own, on]), self._leavers.left
+        own, way = (x.refine(knots, stays=True) for x in (own, on))
         way.pieces[:, who] = own.pieces[:, who]
         return way
 

@@ -115,6 +115,14 @@ class PhaseState:
     # Velocity, acceleration, jerk (3, N, 3) of the slots about the CM, body axes, if an abort has ended a phase.
     rates: Floats | None = None
 
+    @property
+    def attached(self) -> tuple[Pose, Pose, Floats]:
+        """Pose, goal and slots of a state with the frame attached: no phase that moves, or tracks slots, lacks them."""
+        assert self.pose is not None
+        assert self.goal is not None
+        assert self.slots is not None
+        return self.pose, self.goal, self.slots
+
 
 def reference_kind(
     mission: Mission, phase: Shaping, before: Floats, target: Floats | None

@@ -135,19 +135,11 @@ def mission_fragment(
     The name is quoted if TOML requires it. Slots keep all digits, because flat shapes need them. ``edges`` may
     be one of `formation.graphs.GRAPHS`.
     """
-    from rigidfleet._common.toml import toml_key
+    from rigidfleet._common.toml import to_toml
 
-    p = np.asarray(slots, dtype=np.float64) + 0.0  # no -0.0
-    lines = [f"[formations.{toml_key(name)}]", "slots = ["]
-    lines += [f"    {point}," for point in p.tolist()]
-    if isinstance(edges, str):
-        reached = [] if reach is None else [f"reach = {reach!r}"]
-        return "\n".join([*lines, "]", f'edges = "{edges}"', *reached, ""])
-    e = np.asarray(edges, dtype=np.int64).reshape(-1, 2) + 1
-    lines += ["]", "edges = ["]
-    pairs = [f"[{i}, {j}]" for i, j in e.tolist()]
-    lines += [f"    {', '.join(pairs[k : k + 8])}," for k in range(0, len(pairs), 8)]
-    return "\n".join([*lines, "]", ""])
+    pairs = edges if isinstance(edges, str) else np.reshape(edges, (-1, 2)).astype(np.int64) + 1
+    points = np.asarray(slots, dtype=np.float64) + 0.0  # no -0.0
+    return to_toml({"formations": {name: {"slots": points, "edges": pairs, "reach": reach}}})
 
 
 def _rows_of_jacobian(flat: Floats, edges: Ints) -> Floats:
