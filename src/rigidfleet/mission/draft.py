@@ -78,7 +78,9 @@ def draft(
         raise ValueError(f"{n} agents are too many: a new mission has at most {MOST_AGENTS}")
     if not np.isfinite([thrust_limit or 0.0, mass, *size, *np.ravel(waypoints or ())]).all():
         raise ValueError("masses, sizes, limits and waypoints must be finite")
-    slots = shapes.slots(shape, list(size) * (3 if _is_box(shape, size) else 1), n)
+    if len(size) == 1 and shapes.SHAPES[shape].sizes == 3:
+        size = [size[0]] * 3
+    slots = shapes.slots(shape, list(size), n)
     nearest = float(proximity.nearest(slots).min()) if n > 1 else SIZE
     radius = min(RADIUS, nearest / 4)
     start, below = _start(slots, min(_APART, nearest))
@@ -102,8 +104,6 @@ def draft(
     lasts = climb + blend + _SETTLE + sum(time for _, time in flights) + _HOLD
     limit = math.ceil(LIFT * mass * 9.81) if thrust_limit is None else thrust_limit
     extent = json.dumps([float(x) for x in size]) if len(size) > 1 else f"{size[0]:g}"
-    if _is_box(shape, size):
-        extent = json.dumps([float(size[0])] * 3)
     text = templates("rigidfleet.mission", escape=False).get_template("mission.toml").render(
         name=json.dumps(name, ensure_ascii=False), file=file or f"{name}.toml",
         title=f"{n} vehicles fly as a {shape}" if n > 1 else "One vehicle flies",
@@ -134,11 +134,6 @@ def agents_for(shape: str) -> int:
     taken = shapes.SHAPES[shape].agents
     usual = {"line": 3, "polygon": 5, "pyramid": 5, "v": 5, "grid": 9, "sphere": 12, "helix": 12}
     return usual.get(shape, taken.start)
-
-
-def _is_box(shape: str, size: Sequence[float]) -> bool:
-    """Whether one size is given for a shape with three sizes."""
-    return len(size) == 1 and shapes.SHAPES[shape].sizes == 3
 
 
 def _start(slots: Floats, apart: float) -> tuple[Floats, bool]:

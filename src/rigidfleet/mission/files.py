@@ -254,11 +254,11 @@ def _read_heights(data: bytes, name: str) -> Content:
     except (ValueError, EOFError, OSError):
         remedy = "give rows of equal length, separated by commas, or an NPY array"
         raise read_error(name, "is not a table of numbers", remedy) from None
-    if heights.ndim == 2 and (why := missing_cells(heights)):
-        raise read_error(name, why, FILL)
     if heights.ndim != 2 or not heights.size:
         remedy = "give two or more rows of heights [m]"
         raise read_error(name, "is not a table of numbers", remedy)
+    if why := missing_cells(heights):
+        raise read_error(name, why, FILL)
     if heights.size > bounds.HEIGHTS:
         problem = f"has {heights.size:,} heights; the maximum is {bounds.HEIGHTS:,}"
         raise read_error(name, problem, "use a coarser grid")
