@@ -452,8 +452,7 @@ class Aborts:
             if pads is None or (both >= pads).any() or step.least.separation <= 0.0:
                 who, limit = agent_names(step.least.agents), f"(limit {self.need:g} m)"
                 return f"{who} come within {max(apart, 0.0):.2f} m {on} {limit}"
-        things = [*self.mission.solids, *self.wrecks]
-        things = [x for x in things if x.solid.moves or not along]
+        things = [x for x in (*self.mission.solids, *self.wrecks) if x.solid.moves or not along]
         v = way.states(np.linspace(0.0, step.duration, _LOOKS), 2)[1]
         far, when = step.duration * float(np.linalg.norm(v, axis=2).max()), np.array([begin])
         moved = (

@@ -227,10 +227,8 @@ def _vehicle_mismatch(phase: Follow, now: PhaseState) -> str:
     if now.rates is not None and not alone:
         speed = speed + now.rates[0] @ pose.T
     length = phase.travel or (phase.duration if isinstance(phase.duration, float) else knots[-1])
-    off = (
-        np.linalg.norm(first[..., 0] - place, axis=1),
-        np.linalg.norm(first[..., 1] * (knots[-1] / length) - speed, axis=1),
-    )
+    missed = first[..., 0] - place, first[..., 1] * (knots[-1] / length) - speed
+    off = np.linalg.norm(missed, axis=2)
     for far, most, unit in zip(off, _START_TOLERANCES, ("m", "m/s"), strict=False):
         i = int(far.argmax())
         if far[i] > most:

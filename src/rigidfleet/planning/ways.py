@@ -288,14 +288,9 @@ class _Search:
     def _missing_clearance(self, mission: Mission, leg: Leg) -> float:
         """How much [m] the clearance of a planned leg is below what is asked for; negative if it is kept."""
         planned = planned_phase(leg, max(samples_per_phase(mission), FEWEST_SAMPLES))
-        low, high = planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))
         speed, need, radius = speed_bounds(planned), self.phase.clearance, mission.fleet.radius
         least = math.inf
         for thing in mission.obstacles:
-            a, b = extent(thing.solid)
-            beside = np.maximum(np.maximum(a - high, low - b), 0.0)
-            if np.linalg.norm(beside) - radius.max() > min(least, need + 1.0):
-                continue
             clearance, agent, time, proved = closest(planned, thing, radius, speed)
             if proved < least:
                 least = proved

@@ -54,9 +54,9 @@ def design(
     hold there), plus `extra` redundant ones. Let M be the sum of a a^T over the chosen rows a of J (without the rigid
     motions), and w its smallest eigenvalue. Edges are exchanged, the best pair at a time, as long as this lowers the
     barrier potential tr (M - t)^-1, for t = 0 and then closer and closer to w (Batson, Spielman and Srivastava,
-    2012). The search starts from all candidates thinned out, or from Delaunay's triangulation or the convex hull if these
-    have enough edges, whichever is best, and again from perturbed designs while its budget lasts: a tenth of a second for 8 agents, one
-    or two seconds for 30 to 100.
+    2012). The search starts from all candidates thinned out, or Delaunay's triangulation or the convex hull, if it has
+    enough edges, whichever is best, and again from perturbed designs while its budget lasts: a tenth of a second for 8
+    agents, one or two seconds for 30 to 100.
 
     Parameters
     ----------
