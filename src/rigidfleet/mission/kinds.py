@@ -27,7 +27,7 @@ class Settle(Part):
     """The phase ends when its error has stayed within a tolerance for some time."""
 
     tolerance: values.Tolerance = key("maximum error [m]", 1e-3)
-    dwell: values.Dwell = key("time that the error must stay within tolerance [s]", 1.0)
+    dwell: values.Seconds = key("time that the error must stay within tolerance [s]", 1.0)
     timeout: values.Time = key("time after which the mission fails [s]", 60.0)
 
 

@@ -363,8 +363,7 @@ def _law(mission: Mission, mu: float, *, damped: bool) -> ConstraintLaw:
 
 def _control(mission: Mission, phase: Phase, masses: Floats) -> Control:
     kind = {"open": OPEN, "tracking": TRACKING, "body": BODY}[phase.control]
-    force = np.empty((len(masses), 3))
-    force[:] = phase.input_force
+    force = np.tile(np.array(phase.input_force, dtype=float), (len(masses), 1))
     force[:, 2] += masses * mission.gravity
     allocation = mission.allocation
     method = RIGID if allocation.method == "rigid" else SPLITS[allocation.torque_split]
