@@ -21,6 +21,7 @@ from scipy.spatial.distance import pdist
 
 from rigidfleet.formation import assignment, shapes
 from rigidfleet.math import proximity
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Mission
 from rigidfleet.planning import transfers
 from rigidfleet.planning.preview import preview
@@ -210,10 +211,9 @@ def solved(name, start, goal, distance, speed, acceleration, box, downwash):
     if found is None:
         return name, took, np.inf, 0.0
     # Not the proof: dense samples, beside it.
-    sampled = min(
-        pdist(r * [1, 1, 1 / downwash]).min()
-        for r in found.at(np.linspace(0, found.duration, 2001))
-    )
+    ways = Piecewise.b_spline(found.control, found.duration)
+    places = ways.at(np.linspace(0, found.duration, 2001)) * [1, 1, 1 / downwash]
+    sampled = min(pdist(r).min() for r in places)
     assert sampled >= found.certificate.separation - 1e-9
     alone = transfers.least_duration(start, goal, speed, acceleration)
     return name, took, found.duration / alone, found.certificate.separation / distance

@@ -294,7 +294,6 @@ until = 0.5
     held = again.mission.obstacles[0]
     assert held.kind == "heights"
     assert held.heights == tuple(map(tuple, MAP.tolist()))
-    assert "# kept" in again.mission.text
     with pytest.raises(MissionError, match="no such file"):
         load_mission(tmp_path / "m.toml")
     file = file.with_suffix(".csv")

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import weakref
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ def solver_of(p, edges, masses, law, *, eliminated=False, tolerance=1e-13) -> La
     if eliminated:
         steps = solvers.elimination_steps(len(p), edges)
         order = None if steps is None else ordering.prepare_order(steps, edges)
-    setup = Setup(order, solvers.Dissection(p, edges), tolerance)
+    setup = Setup(order, cache(partial(solvers.dissection, p, edges)), tolerance)
     return LargeSolver(vehicles, edges.astype(np.uint32), law, work, setup)
 
 

@@ -261,12 +261,9 @@ def _read_ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, .
     if len(names) == 3:
         return values, None, ()
     types = {columns[name] for name in names[3:]}
-    colours, real = (
-        values[:, 3:] / (65535.0 if types == {"u2"} else 1.0),
-        types <= {"u2", "f4", "f8"},
-    )
+    colours = values[:, 3:] / (65535.0 if types == {"u2"} else 1.0)
     colours = colours if colours.max(initial=0.0) <= 1.0 else np.round(colours)
-    return values[:, :3].copy(), _hexadecimal(colours, real=real), ()
+    return values[:, :3].copy(), _hexadecimal(colours, real=types <= {"u2", "f4", "f8"}), ()
 
 
 def _bytes_before_vertices(

@@ -51,8 +51,6 @@ def _disturbing_accelerations(
     error = np.broadcast_to(np.array(disturbances.mass_error, dtype=float), len(models))
     by_wind = [
         (max(model.linear_drag) + max(model.body_drag) * wind) * wind / model.mass
-        if not model.point
-        else model.drag * wind / model.mass
         for model in models
     ]
     limit = np.array([model.thrust_limit / model.mass for model in models])

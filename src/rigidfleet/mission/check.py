@@ -379,8 +379,7 @@ def _areas(m: Draft) -> Breaches:
                 areas.append(area)
         m.parts[table] = tuple(areas)
     if m.people and m.is_valid((), "gravity") and m.gravity < 1.0:
-        yield Breach(
-            "gravity", "is too low for falls onto people", "raise it, or remove [[people]]"
-        )
+        remedy = "raise it, or remove [[people]]"
+        yield Breach("gravity", "is too low for falls onto people", remedy)
     if m.limits.model_fields_set & {"people"} and not m.data.get("people"):
         yield Breach(("limits", "people"), "has no effect without people", "add [[people]]")

@@ -24,9 +24,9 @@ LIFT = 2.2
 _SPEED, _ACCELERATION = 4.0, 1.2
 #: Distance of vehicles on the ground, centre to centre [m].
 _APART = 1.2
-#: Up to _FEW agents start below their slots, or beside that point if slots lie above each other. More agents with
-#: slots above each other start on a grid with spacing _WIDE [m], more than sqrt(2) (two radii + separation).
-_FEW, _WIDE = 20, 1.5
+#: Agents start below their slots. Those with slots above each other start on a grid with spacing _WIDE [m], more than
+#: sqrt(2) (two radii + separation).
+_WIDE = 1.5
 #: Time to settle after a change of formation, and duration of the hold at the end [s].
 _SETTLE, _HOLD = 2, 3
 #: Approximate number of agent positions that the result of a new mission stores.
@@ -51,8 +51,8 @@ def draft(
     """Return the TOML text of a mission: take off, form a shape, fly it to waypoints, hold.
 
     With a shape and a number of agents alone, the mission flies as it is. Other numbers are not validated here but when
-    the mission is checked. Agents start below their slots; where slots lie above each other, many agents start on a
-    grid and take the nearest slots.
+    the mission is checked. Agents start below their slots; where slots lie above each other, they start on a grid
+    and take the nearest slots.
 
     Parameters
     ----------
@@ -78,7 +78,9 @@ def draft(
         raise ValueError(f"{n} agents are too many: a new mission has at most {MOST_AGENTS}")
     if not np.isfinite([thrust_limit or 0.0, mass, *size, *np.ravel(waypoints or ())]).all():
         raise ValueError("masses, sizes, limits and waypoints must be finite")
-    slots = shapes.slots(shape, list(size) * (3 if _is_box(shape, size) else 1), n)
+    if len(size) == 1 and shapes.SHAPES[shape].sizes == 3:
+        size = [size[0]] * 3
+    slots = shapes.slots(shape, list(size), n)
     nearest = float(proximity.nearest(slots).min()) if n > 1 else SIZE
     radius = min(RADIUS, nearest / 4)
     start, below = _start(slots, min(_APART, nearest))
@@ -102,8 +104,6 @@ def draft(
     lasts = climb + blend + _SETTLE + sum(time for _, time in flights) + _HOLD
     limit = math.ceil(LIFT * mass * 9.81) if thrust_limit is None else thrust_limit
     extent = json.dumps([float(x) for x in size]) if len(size) > 1 else f"{size[0]:g}"
-    if _is_box(shape, size):
-        extent = json.dumps([float(size[0])] * 3)
     text = templates("rigidfleet.mission", escape=False).get_template("mission.toml").render(
         name=json.dumps(name, ensure_ascii=False), file=file or f"{name}.toml",
         title=f"{n} vehicles fly as a {shape}" if n > 1 else "One vehicle flies",
@@ -136,37 +136,19 @@ def agents_for(shape: str) -> int:
     return usual.get(shape, taken.start)
 
 
-def _is_box(shape: str, size: Sequence[float]) -> bool:
-    """Whether one size is given for a shape with three sizes."""
-    return len(size) == 1 and shapes.SHAPES[shape].sizes == 3
-
-
 def _start(slots: Floats, apart: float) -> tuple[Floats, bool]:
-    """Return start positions (N, 3) [m] on the ground, and whether each is below, or beside the point below, its slot.
+    """Return start positions (N, 3) [m] on the ground, and whether each is below its slot.
 
-    Where slots lie above each other, up to `_FEW` agents move outwards until there is room; more agents start on a
-    grid.
+    Where slots lie above each other, agents start on a grid, or few on a line.
     """
     n = len(slots)
     across = slots * [1.0, 1.0, 0.0]
     ground = np.array([0.0, 0.0, 0.3])
     if n == 1 or proximity.nearest(across).min() >= apart * (1 - 1e-9):
         return across + ground, True
-    if n > _FEW:
-        # Straight paths to the nearest slots need this spacing (docs/many.md).
-        return shapes.slots("grid", max(_WIDE, apart), n) + ground, False
-    order = np.argsort(slots[:, 2], kind="stable")
-    placed: list[Floats] = []
-    start = np.empty_like(slots)
-    for i in order.tolist():
-        way = slots[i, :2]
-        out = way / np.linalg.norm(way) if np.linalg.norm(way) > 1e-9 else np.array([1.0, 0.0])
-        place = way
-        while any(np.linalg.norm(place - other) < apart * (1 - 1e-9) for other in placed):
-            place = place + 0.5 * apart * out
-        placed.append(place)
-        start[i] = [*place, 0.3]
-    return start, True
+    # Straight paths to the nearest slots need this spacing (docs/many.md).
+    pads = "grid" if n in shapes.SHAPES["grid"].agents else "line"
+    return shapes.slots(pads, max(_WIDE, apart), n) + ground, False
 
 
 def blend_time(way: float) -> int:

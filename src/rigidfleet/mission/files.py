@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -18,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.toml import text_has_data, to_toml
+from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, TrajectoryError
 from rigidfleet.mission import bounds
 from rigidfleet.mission.text import read_error
@@ -56,6 +55,8 @@ class Content(NamedTuple):
 def with_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, Any], str]:
     """A mission in which numbers stand instead of the names of files, with the SHA-256 digest of each in its text.
 
+    That text is written anew, without comments.
+
     Parameters
     ----------
     data, text : what the mission's text says, which is changed, and the text
@@ -83,16 +84,9 @@ def with_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, A
         if named.becomes == "trajectories":
             named.table.pop("units", None), named.table.pop("axes", None)
         named.table[named.becomes] = rows
-        written = "".join(f"  {row!r},\n" for row in rows)
-        line = re.compile(rf"^([ \t]*){named.key}\s*=\s*([\"']){re.escape(name)}\2", re.MULTILINE)
-        put = f"# {origin}\n{named.becomes} = [\n{written}]"
-        if colours is not None and named.becomes == "slots" and "colour" not in named.table:
-            named.table["colour"] = [*colours]
-            put += f"\ncolour = {json.dumps(colours)}"
-        text = line.sub(lambda m, put=put: m[1] + put, text, count=1)
-    if digests and not text_has_data(text, data):  # where a file is named within a line
-        text = "".join(digests) + to_toml(data)
-    return data, text
+        if colours is not None and named.becomes == "slots":
+            named.table.setdefault("colour", [*colours])
+    return data, "".join(digests) + to_toml(data) if digests else text
 
 
 def digest_lines(text: str) -> str:
@@ -259,11 +253,11 @@ def _read_heights(data: bytes, name: str) -> Content:
     except (ValueError, EOFError, OSError):
         remedy = "give rows of equal length, separated by commas, or an NPY array"
         raise read_error(name, "is not a table of numbers", remedy) from None
-    if heights.ndim == 2 and (why := missing_cells(heights)):
-        raise read_error(name, why, FILL)
     if heights.ndim != 2 or not heights.size:
         remedy = "give two or more rows of heights [m]"
         raise read_error(name, "is not a table of numbers", remedy)
+    if why := missing_cells(heights):
+        raise read_error(name, why, FILL)
     if heights.size > bounds.HEIGHTS:
         problem = f"has {heights.size:,} heights; the maximum is {bounds.HEIGHTS:,}"
         raise read_error(name, problem, "use a coarser grid")

@@ -47,18 +47,15 @@ class FindingCollector:
     @property
     def findings(self) -> list[Finding]:
         """All findings without repetition: of many of one kind, the first ones and the number of the others."""
-        more = [
-            Finding(
-                self.origin,
-                _key_path(kind),
-                None,
-                f"{n - _MOST_OF_A_KIND:,} more of this kind",
-                "correct all of them",
-            )
-            for kind, n in self._counts.items()
-            if n > _MOST_OF_A_KIND
-        ]
-        return [*self._findings.values(), *more]
+        findings = [*self._findings.values()]
+        for kind, n in self._counts.items():
+            if n > _MOST_OF_A_KIND:
+                problem, remedy = (
+                    f"{n - _MOST_OF_A_KIND:,} more of this kind",
+                    "correct all of them",
+                )
+                findings.append(Finding(self.origin, _key_path(kind), None, problem, remedy))
+        return findings
 
     def add(self, path: Keys, problem: str, remedy: str, *value: object) -> None:
         """Record a finding. Unless a value is given, it is the one that the user wrote at the path."""

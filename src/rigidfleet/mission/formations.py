@@ -37,19 +37,13 @@ def coincident_pairs(points: ArrayLike) -> list[tuple[int, int]]:
     if len(p) < 2:
         return []
     # Cells first: a search tree of many equal points degenerates and compares all pairs.
-    cell = np.round(p / apart)
-    order = np.lexsort(cell.T)
-    new = np.append(True, (np.diff(cell[order], axis=0) != 0).any(axis=1))
-    first = np.empty(len(p), dtype=np.int64)
-    first[order] = order[np.flatnonzero(new)[np.cumsum(new) - 1]]
-    later = np.flatnonzero(first != np.arange(len(p)))
-    if not len(later):
-        later = np.flatnonzero(proximity.nearest(p) < apart)[1:]
-        for j in later:
-            away = np.linalg.norm(p - p[j], axis=1)
-            away[j] = np.inf
-            first[j] = away.argmin()
-    return [(int(first[j]), int(j)) for j in later if first[j] < j]
+    _, one, cell = np.unique(np.round(p / apart), axis=0, return_index=True, return_inverse=True)
+    first, own = one[cell.ravel()], np.arange(len(p))
+    if len(one) == len(p) and (proximity.nearest(p) < apart).any():
+        from scipy.spatial import KDTree
+
+        return sorted(KDTree(p).query_pairs(apart))
+    return list(zip(first[first < own].tolist(), own[first < own].tolist(), strict=True))
 
 
 def most_edges(n: int) -> int:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from rigidfleet._common.renamed import with_earlier_names
@@ -12,6 +13,7 @@ from rigidfleet.foreign.curves import rows_to_curve
 from rigidfleet.math.piecewise import Piecewise, join
 from rigidfleet.mission import values
 from rigidfleet.mission.values import AUTO, Part, key, models_by_kind, required_key
+from rigidfleet.typing import Ints
 
 #: Keys of a phase that may be automatic, and the word for it.
 TIMES = ("duration", "travel", "blend")
@@ -25,7 +27,7 @@ class Settle(Part):
     """The phase ends when its error has stayed within a tolerance for some time."""
 
     tolerance: values.Tolerance = key("maximum error [m]", 1e-3)
-    dwell: values.Dwell = key("time that the error must stay within tolerance [s]", 1.0)
+    dwell: values.Seconds = key("time that the error must stay within tolerance [s]", 1.0)
     timeout: values.Time = key("time after which the mission fails [s]", 60.0)
 
 
@@ -433,6 +435,10 @@ class Vertical(Arriving):
         "in the order of their numbers",
         "rows",
     )
+
+    def movers(self, n: int) -> Ints:
+        """Numbers, from 0, of the vehicles that move, of n."""
+        return np.array(self.agents, dtype=np.int64) - 1 if self.agents else np.arange(n)
 
     @property
     def flown_as_written(self) -> bool:

@@ -71,12 +71,8 @@ def _abort(m: Draft) -> Breaches:
     options: Aborting | None = m.abort
     if options is not None:
         for k, agent in enumerate(options.agents):
-            yield from agents_exist(
-                m,
-                ("abort", "agents", k),
-                (agent,),
-                "leaves twice" if agent in options.agents[:k] else "",
-            )
+            again = "leaves twice" if agent in options.agents[:k] else ""
+            yield from agents_exist(m, ("abort", "agents", k), (agent,), again)
     if options is None or options.at is None or m.end is None or m.findings:
         return
     begins = options.at + options.reaction
@@ -191,8 +187,6 @@ def _uneven(points: Floats, radius: Sequence[float]) -> str:
     low = int(bottom.argmin())
     across = np.hypot(*(points[:, :2] - points[low, :2]).T)
     over = np.flatnonzero((across < size + size[low]) & (bottom > bottom[low] + LEVEL))
-    return (
-        f"{words}, and {agent_names(sorted((low, over[0])))} stand one above the other"
-        if len(over)
-        else words
-    )
+    if not len(over):
+        return words
+    return f"{words}, and {agent_names(sorted((low, over[0])))} stand one above the other"

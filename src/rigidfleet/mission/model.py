@@ -315,12 +315,7 @@ class Mission(Contents, Shown):
                 lies = commanded = None
             if (vertical := p.vertical) is not None and vertical.each:
                 before, up = None, np.eye(3)[2] if lies is None else lies[:, 2]
-                who = (
-                    np.array(vertical.agents, dtype=np.int64) - 1
-                    if vertical.agents
-                    else slice(None)
-                )
-                places = places.copy()
+                who, places = vertical.movers(self.n_agents), places.copy()
                 places[who] -= np.outer(places[who] @ up, up)  # all on one level
             if (shaping := p.shaping) is None:
                 continue
@@ -361,11 +356,9 @@ class Mission(Contents, Shown):
     def drawn_attitude(self) -> Floats:
         """Attitude (3, 3), world to body, in which formations are drawn: world axes, or those of [body_frame]."""
         b = self.body_frame
-        return (
-            np.eye(3)
-            if b is None
-            else dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
-        )
+        if b is None:
+            return np.eye(3)
+        return dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
 
     def establish_attitude(self, phase: Establish, commanded: Floats | None) -> Floats:
         """Attitude (3, 3) in which a phase establishes its formation, if the attitude is not free.

@@ -42,6 +42,5 @@ def rules(m: Draft) -> Breaches:
     for k, p in enumerate(m.phases):
         if p.control == "body":
             problem = f"phase {k + 1} is flown by a wrench on the body, which no vehicle computes from its neighbours"
-            yield Breach(
-                (), problem, "use control = 'tracking' or 'open', or remove [network]", None
-            )
+            remedy = "use control = 'tracking' or 'open', or remove [network]"
+            yield Breach((), problem, remedy, None)

@@ -102,9 +102,8 @@ def _phases(m: Draft) -> Generator[Breach, None, list[Any]]:
         defaults = {"name": f"{data['kind']} {k + 1}", "control": control}
         phases.append(m.validate(model, data, ("phases", k), defaults))
     if not phases and m.is_valid((), "phases"):
-        yield Breach(
-            "phases", "there is no phase", "add [[phases]], one for each step of the flight", None
-        )
+        remedy = "add [[phases]], one for each step of the flight"
+        yield Breach("phases", "there is no phase", remedy, None)
     return phases
 
 
@@ -367,11 +366,8 @@ def _reshape(m: Draft, p: Reshape, k: int, _: float | None) -> Breaches:
     rows, n = p.control_points, m.n
     if rows is not None and n is not None:
         if len(rows) < 4 or any(len(row) != n for row in rows):
-            problem, remedy = (
-                "is no list of four or more rows of slots",
-                f"give {n} points in each row",
-            )
-            yield Breach("control_points", problem, remedy, None)
+            problem = "is no list of four or more rows of slots"
+            yield Breach("control_points", problem, f"give {n} points in each row", None)
         elif p.transition != "straight" or p.alignment != "none" or p.control != "tracking":
             problem = "needs tracked slots, alignment = 'none' and no transition"
             remedy = "correct these keys, or use transition = 'ways'"
@@ -431,9 +427,8 @@ def _formations(m: Draft, phases: Written) -> Breaches:
             form = forms.get(shaping.formation)
             if p.establishing is None and held == "":
                 problem = "no formation has been established yet"
-                yield Breach(
-                    (*path, "kind"), problem, "use kind = 'establish' for the first formation"
-                )
+                remedy = "use kind = 'establish' for the first formation"
+                yield Breach((*path, "kind"), problem, remedy)
             drawn = m.data["phases"][k].get("attitude") == "drawn" and m.is_valid(path, "attitude")
             if drawn and form is not None and not form.knows_slots:
                 problem = f"formation '{shaping.formation}' is given by distances alone, which have no axes"
@@ -494,9 +489,8 @@ def _smoothness(m: Draft, p: Phase, k: int) -> Breaches:
         return
     if p.control == "body":
         problem = "has regulators of its own, which jump at a switch; smoothness = 'jerk' needs control = 'tracking'"
-        yield Breach(
-            "control", problem, "use control = 'tracking', or remove smoothness", p.control
-        )
+        remedy = "use control = 'tracking', or remove smoothness"
+        yield Breach("control", problem, remedy, p.control)
     shaping = p.shaping
     if shaping is not None and shaping.reference == "step" and p.control == "tracking":
         problem = "jumps, but the mission has smoothness = 'jerk'"

@@ -117,11 +117,8 @@ def show_text(
     """
     if not 2 <= agents <= MOST_AGENTS:
         raise ValueError(f"a show takes 2 to {MOST_AGENTS} agents, not {agents}")
-    for what, value in (
-        ("spacing", spacing),
-        ("mass", mass),
-        ("thrust limit", thrust_limit or 1.0),
-    ):
+    numbers = {"spacing": spacing, "mass": mass, "thrust limit": thrust_limit or 1.0}
+    for what, value in numbers.items():
         if not 0.0 < value < math.inf:
             raise ValueError(f"the {what} must be a positive number, not {value:g}")
     if not scenes:

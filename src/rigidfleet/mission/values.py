@@ -57,7 +57,6 @@ LengthOrZero = Annotated[float, Strict(), from_zero(LENGTH)]
 Time = Annotated[float, Strict(), _positive(TIME)]
 #: A time of the mission, from its start on.
 Seconds = Annotated[float, Strict(), from_zero(TIME)]
-Dwell = Annotated[float, Strict(), from_zero(TIME)]
 Speed = Annotated[float, Strict(), _positive(SPEED)]
 Spread = Annotated[float, Strict(), from_zero(SPEED)]
 Acceleration = Annotated[float, Strict(), _positive(ACCELERATION)]

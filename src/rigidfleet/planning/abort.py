@@ -452,8 +452,7 @@ class Aborts:
             if pads is None or (both >= pads).any() or step.least.separation <= 0.0:
                 who, limit = agent_names(step.least.agents), f"(limit {self.need:g} m)"
                 return f"{who} come within {max(apart, 0.0):.2f} m {on} {limit}"
-        things = [*self.mission.solids, *self.wrecks]
-        things = [x for x in things if x.solid.moves or not along]
+        things = [x for x in (*self.mission.solids, *self.wrecks) if x.solid.moves or not along]
         v = way.states(np.linspace(0.0, step.duration, _LOOKS), 2)[1]
         far, when = step.duration * float(np.linalg.norm(v, axis=2).max()), np.array([begin])
         moved = (
@@ -681,12 +680,8 @@ class Aborts:
         on = _concatenate(ways)
         before = [on.between(0.0, waits)] if waits else []
         own = _concatenate([*before, *(step.way for step in steps)])
-        knots = common_knots([own, on])
-        own, way, who = (
-            own.refine(knots, stays=True),
-            on.refine(knots, stays=True),
-            self._leavers.left,
-        )
+        knots, who = common_knots([own, on]), self._leavers.left
+        own, way = (x.refine(knots, stays=True) for x in (own, on))
         way.pieces[:, who] = own.pieces[:, who]
         return way
 

@@ -78,23 +78,17 @@ class Detour:
         def derivatives_at(x: Floats, end: Floats) -> Floats:
             value, rate, second = x
             bend = (end - second) * share
-            return np.array(
-                [
-                    value + dt * (rate + dt * (second / 2 + bend / 6)),
-                    rate + dt * (second + bend / 2),
-                    second + bend,
-                ]
-            )
+            place = value + dt * (rate + dt * (second / 2 + bend / 6))
+            return np.array([place, rate + dt * (second + bend / 2), second + bend])
 
         # The rotation vector from Q, whose rates are those of the body as long as it is small
         spin = derivatives_at(np.array([np.zeros(3), *self.omega]), accelerations[3:6])
         Q = att.dcm_from_rotation_vector(spin[0]).T @ self.Q
-        return Detour(
+        x, scale = (
             derivatives_at(self.x, accelerations[:3]),
-            Q,
-            spin[1:],
             derivatives_at(self.scale, accelerations[6]),
         )
+        return Detour(x, Q, spin[1:], scale)
 
     def series(self) -> tuple[Floats, Floats, Floats]:
         """Taylor series of displacement (3, 3), rotation (3, 3, 3), body to world, and scale (3,)."""
@@ -132,22 +126,16 @@ def nearest_accelerations(
 
     The distance is that of Gauss's principle, of masses (N,) at ``arms`` (N, 3) from the body's origin.
     """
-    spread = (
-        np.eye(3)[None] * (arms * arms).sum(axis=1)[:, None, None]
-        - arms[:, :, None] * arms[:, None]
-    )
+    squares = (arms * arms).sum(axis=1)
+    spread = np.eye(3) * squares[:, None, None] - arms[:, :, None] * arms[:, None]
     inertia = np.einsum("i,ijk->jk", masses, spread)
-    radial = float(masses @ (arms * arms).sum(axis=1)) / scale**2
+    radial = float(masses @ squares) / scale**2
     centre = masses @ arms
     # Of a body whose origin is not its centre of mass, displacement and rotation are coupled.
     H = np.zeros((7, 7))
     H[:3, :3] = masses.sum() * np.eye(3)
     H[3:6, 3:6] = inertia
-    H[:3, 3:6] = [
-        [0.0, centre[2], -centre[1]],
-        [-centre[2], 0.0, centre[0]],
-        [centre[1], -centre[0], 0.0],
-    ]
+    H[:3, 3:6] = np.cross(centre, np.eye(3))
     H[3:6, :3] = H[:3, 3:6].T
     H[:3, 6] = H[6, :3] = centre / scale
     H[6, 6] = radial

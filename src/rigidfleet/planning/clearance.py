@@ -111,14 +111,12 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
     in the middle, and so on.
     """
     (reference, motion), solid = planned.leg.paths, thing.solid
-    met: Obstacle | _Thing = thing
     time, position = planned.time, planned.position
     if np.isfinite(solid.there).any():
         time, position, speed = _path_while_present(planned, *solid.there[0].tolist(), speed)
-        met = _Thing(solid._replace(there=np.array([[-np.inf, np.inf]])))
     if not len(time):
         return Closest(np.inf, 0, float(planned.time[0]), np.inf)
-    each, _ = proximity.obstacle_clearances(position, radius, [met], time)
+    each, _ = proximity.obstacle_clearances(position, radius, [thing], time)
     k, i = np.unravel_index(int(each.argmin()), each.shape)
     best, agent, when = float(each[k, i]), int(i), float(time[k])
     everybody, least, done = np.arange(each.shape[1]), np.inf, 0
@@ -128,7 +126,7 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
         spans = todo.popleft()
         way = spans.speed * spans.length[:, None]
         if solid.moves:
-            way = way + greatest_way(met.solid, spans.first, spans.first + spans.length)[:, None]
+            way = way + greatest_way(solid, spans.first, spans.first + spans.length)[:, None]
         low = 0.5 * (spans.near + spans.far - way)
         open_ = low < best - CLOSE
         if not open_.any():
@@ -147,7 +145,7 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
         half = 0.5 * spans.length
         middle, who = spans.first + half, spans.who
         r = slot_derivatives(reference_of_agents(reference, who), motion, middle, 1)[:, 0]
-        between, _ = proximity.obstacle_clearances(r, radius[who], [met], middle)
+        between, _ = proximity.obstacle_clearances(r, radius[who], [thing], middle)
         k, i = np.unravel_index(int(between.argmin()), between.shape)
         if between[k, i] < best:
             best, agent, when = float(between[k, i]), int(who[i]), float(middle[k])
@@ -159,12 +157,6 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
             )
         )  # fmt: skip
     return Closest(best, agent, when, min(least, best - CLOSE))
-
-
-class _Thing(NamedTuple):
-    """An obstacle that is always there."""
-
-    solid: Solids
 
 
 def _path_while_present(

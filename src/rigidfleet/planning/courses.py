@@ -107,43 +107,39 @@ def _fly(mission: Mission, phase: Fly, now: PhaseState, t_end: float) -> Course:
 
 def _turn(mission: Mission, phase: Turn, now: PhaseState, t_end: float) -> Course:
     """Turn to an attitude on the spot."""
-    assert now.goal is not None  # a steering phase has a goal
-    return _steer(mission, phase, now, t_end, now.goal.r, np.zeros(3))
+    return _steer(mission, phase, now, t_end, now.attached[1].r, np.zeros(3))
 
 
 def _steer(
     mission: Mission, phase: Steering, now: PhaseState, t_end: float, r: Floats, v: Floats
 ) -> Course:
     """Go to a place (3,) with a velocity there and an attitude, within ``travel`` or by the end."""
-    assert now.goal is not None  # a steering phase has a goal
+    _, before, _ = now.attached
     arrival = t_end if phase.travel is None else now.t + seconds(phase.travel)
     angles = phase.attitude_deg
-    T = now.goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
-    named = now.goal.named or angles is not None
+    T = before.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
+    named = before.named or angles is not None
     goal = Pose(r, v, T, np.deg2rad(phase.rates_deg_s), named)
     return _course_to(mission, phase, now, goal, arrival, t_end)
 
 
 def _orbit(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Course:
     """Fly a circle, and continue with its velocity. An attitude that turns along is not an explicitly specified one."""
-    assert now.pose is not None  # slots are tracked
-    assert now.goal is not None
-    motion = orbit_motion(phase, now.pose, now.goal.T, now.t, t_end, smooth=mission.smooth)
-    named = now.goal.named and not phase.turns_away
+    pose, goal, _ = now.attached
+    motion = orbit_motion(phase, pose, goal.T, now.t, t_end, smooth=mission.smooth)
+    named = goal.named and not phase.turns_away
     return Course(copy_with(pose_at(motion, t_end), named=named), t_end, lambda: motion)
 
 
 def _brake(mission: Mission, phase: Brake, now: PhaseState, t_end: float) -> Course:
     """Come to rest within ``travel`` or by the end, from the reference as it moves now."""
-    assert now.pose is not None  # slots are tracked
-    assert now.goal is not None
+    pose, before, _ = now.attached
     arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
-    motion = stopping_motion(now.pose, now.t, arrival)
+    motion = stopping_motion(pose, now.t, arrival)
     end = pose_at(motion, arrival)
-    turned = now.pose.omega.any() or not np.allclose(now.pose.T, now.goal.T, rtol=0, atol=1e-9)
-    goal = Pose(
-        end.r, np.zeros(3), end.T if turned else now.goal.T, np.zeros(3), now.goal.named and not turned
-    )  # fmt: skip
+    turned = pose.omega.any() or not np.allclose(pose.T, before.T, rtol=0, atol=1e-9)
+    T = end.T if turned else before.T
+    goal = Pose(end.r, np.zeros(3), T, np.zeros(3), before.named and not turned)
     return Course(goal, arrival, lambda: motion)
 
 
@@ -153,8 +149,7 @@ def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) 
     Where each vehicle has a way of its own, the slots follow the same septic from rest to rest: together, each goes
     straight up or down by its own way, and one that stays, stays.
     """
-    assert now.pose is not None
-    assert now.goal is not None
+    pose, before, _ = now.attached
     arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
     up, v, lift = np.zeros(3), np.zeros(3), None
     if phase.each:
@@ -162,12 +157,12 @@ def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) 
         up[2] = masses @ rise / masses.sum()
         if np.ptp(rise) >= _LEVEL:
             travel = min(phase.travel or math.inf, t_end - now.t)
-            lift = Lift(np.outer(rise - up[2], now.goal.T[:, 2]), travel)
+            lift = Lift(np.outer(rise - up[2], before.T[:, 2]), travel)
     else:
         up[2] = -max(0.0, height_above_landing(mission, now))
         v[2] = -min(TOUCH_DOWN, -up[2] / (arrival - now.t))
-    goal = copy_with(now.goal, r=now.goal.r + up, v=v, omega=np.zeros(3))
-    return Course(goal, arrival, partial(smooth_motion, now.pose, goal, now.t, arrival), lift)
+    goal = copy_with(before, r=before.r + up, v=v, omega=np.zeros(3))
+    return Course(goal, arrival, partial(smooth_motion, pose, goal, now.t, arrival), lift)
 
 
 def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> Course:
@@ -175,10 +170,7 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
 
     What the first point of a file differs from the place where the vehicles are fades over `_FADED`.
     """
-    assert now.pose is not None
-    assert now.goal is not None
-    assert now.slots is not None
-    pose, slots = now.pose, now.slots
+    pose, before, slots = now.attached
     way = phase.pieces
     length = t_end - now.t if phase.travel is None else phase.travel
     scale = length / way.time[-1]
@@ -209,22 +201,17 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
     cm = Piecewise(knots, body).start_from(begin, fade)
     motion = as_motion(now.t + cm.time, cm.pieces, T1)
     arrival = float(min(t_end, motion.knots[-1]))
-    goal = copy_with(pose_at(motion, arrival), named=now.goal.named and not phase.turns_away)
+    goal = copy_with(pose_at(motion, arrival), named=before.named and not phase.turns_away)
     return Course(goal, arrival, lambda: motion, lift)
 
 
-def course_conflict(phase: Phase, now: PhaseState) -> str:
+def course_conflict(phase: Any, now: PhaseState) -> str:
     """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
-    return _MISMATCHES.get(phase.kind, lambda *_: "")(phase, now)
-
-
-def _slot_mismatch(phase: Reshape, now: PhaseState) -> str:
-    """What keeps a change of shape from following its bent ways, if it has any."""
     if phase.bent:
         first = np.array(phase.control_points)[0]
         if now.slots is None or not np.abs(first - now.slots).max() < _START_TOLERANCES[0]:
             return "begins in other slots than the phase before has led to"
-    return ""
+    return _vehicle_mismatch(phase, now) if phase.follows_curves else ""
 
 
 def _vehicle_mismatch(phase: Follow, now: PhaseState) -> str:
@@ -240,10 +227,8 @@ def _vehicle_mismatch(phase: Follow, now: PhaseState) -> str:
     if now.rates is not None and not alone:
         speed = speed + now.rates[0] @ pose.T
     length = phase.travel or (phase.duration if isinstance(phase.duration, float) else knots[-1])
-    off = (
-        np.linalg.norm(first[..., 0] - place, axis=1),
-        np.linalg.norm(first[..., 1] * (knots[-1] / length) - speed, axis=1),
-    )
+    missed = first[..., 0] - place, first[..., 1] * (knots[-1] / length) - speed
+    off = np.linalg.norm(missed, axis=2)
     for far, most, unit in zip(off, _START_TOLERANCES, ("m", "m/s"), strict=False):
         i = int(far.argmax())
         if far[i] > most:
@@ -264,16 +249,13 @@ def _vehicle_mismatch(phase: Follow, now: PhaseState) -> str:
 
 def rises(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     """How far [m] each vehicle (N,) goes up from the pose to hold: to a height, or (down) to just above the ground."""
-    assert now.goal is not None
-    assert now.slots is not None
-    n = mission.n_agents
-    place, ground = now.goal.r[2] + now.slots @ now.goal.T[:, 2], _heights_below(mission, now)
+    (_, goal, slots), n = now.attached, mission.n_agents
+    place, ground = goal.r[2] + slots @ goal.T[:, 2], _heights_below(mission, now)
     if phase.level is None:
         up = np.minimum(ground + (ABOVE + mission.fleet.radius) - place, 0.0)
     else:
         up = ground.max() + phase.level - place
-    goes = np.ones(n, dtype=np.bool_) if not phase.agents else np.zeros(n, dtype=np.bool_)
-    goes[np.array(phase.agents, dtype=np.int64) - 1] = True
+    goes = np.isin(np.arange(n), phase.movers(n))
     return np.where(goes if now.lost is None else goes & ~now.lost, up, 0.0)
 
 
@@ -285,9 +267,8 @@ def _heights_below(mission: Mission, now: PhaseState) -> Floats:
     MissionError
         There is nothing below a vehicle.
     """
-    assert now.goal is not None
-    assert now.slots is not None
-    r = now.goal.r + now.slots @ now.goal.T
+    _, goal, slots = now.attached
+    r = goal.r + slots @ goal.T
     heights = mission.height_at(*r.T)
     flying = np.ones(len(r), dtype=np.bool_) if now.lost is None else ~now.lost
     if len(off := np.flatnonzero(flying & ~np.isfinite(heights))):
@@ -300,10 +281,9 @@ def _heights_below(mission: Mission, now: PhaseState) -> Floats:
 
 def height_above_landing(mission: Mission, now: PhaseState) -> float:
     """How far [m] the lowest vehicle is above the height at which a landing ends, at the pose to hold."""
-    assert now.goal is not None
-    assert now.slots is not None
+    _, goal, slots = now.attached
     left = np.ones(mission.n_agents, dtype=np.bool_) if now.lost is None else ~now.lost
-    below = now.goal.r[2] + now.slots @ now.goal.T[:, 2] - mission.fleet.radius
+    below = goal.r[2] + slots @ goal.T[:, 2] - mission.fleet.radius
     return float(below[left].min() - _heights_below(mission, now).min()) - ABOVE
 
 
@@ -344,9 +324,4 @@ _COURSES: dict[str, Callable[[Mission, Any, PhaseState, float], Course]] = {
     "reshape": _reshape,
     "takeoff": _vertical,
     "turn": _turn,
-}
-#: Function of each kind of phase that may follow given ways, which says what keeps it from that.
-_MISMATCHES: dict[str, Callable[[Any, PhaseState], str]] = {
-    "follow": _vehicle_mismatch,
-    "reshape": _slot_mismatch,
 }

@@ -15,7 +15,7 @@ from numpy.polynomial import Polynomial
 
 from rigidfleet.kernel.problem import Motion, Reference, septic_polynomial
 from rigidfleet.math import series
-from rigidfleet.math.piecewise import Piecewise, piece_at
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats, Ints
 
 #: Number of coefficients of a series: position, velocity, acceleration, jerk, snap.
@@ -211,7 +211,8 @@ def yaw_along(
     By the Runge-Kutta method of fourth order on a grid from ``time[0]``; rates at ``time`` are exact. Beside it, a time
     of the grid shortly before the end and the yaw (N,) there, to continue on the same grid.
     """
-    ends = np.append(np.arange(time[0], time[-1], _STEP), time[-1])
+    end = time[-1] if time[-1] > time[0] else time[0] + _STEP  # of a single time
+    ends = np.unique(np.append(np.arange(time[0], end, _STEP), end))
     grid_time = np.concatenate([ends, 0.5 * (ends[:-1] + ends[1:])])
     body = body_series(motion, grid_time)
     on_grid = slot_series(reference, body, grid_time)
@@ -233,7 +234,7 @@ def yaw_along(
     angles = grid
     if not np.array_equal(time, ends):
         rates = _yaw_rate(grid, terms[: len(ends)].swapaxes(0, 1))
-        angles = _hermite(ends, grid, rates, time)
+        angles = Piecewise.hermite(ends, np.stack([grid, rates])).at(time)
     known = max(len(ends) - 3, 0)
     angles = angles.T
     now, (A_dot, B_dot, C_dot) = _yaw_terms(slots)
@@ -270,13 +271,3 @@ def _yaw_terms(slots: Floats) -> tuple[Floats, Floats]:
 def _yaw_rate(yaw: Floats, terms: Floats) -> Floats:
     """Rate of yaw "along" [rad/s] at yaws (...) from the `_yaw_terms` terms (3, ...)."""
     return terms[0] + terms[1] * np.cos(yaw) + terms[2] * np.sin(yaw)
-
-
-def _hermite(knots: Floats, y: Floats, rates: Floats, time: Floats) -> Floats:
-    """Cubics through values and rates (n, N) at knots (n,), at times (K,) between them."""
-    k = piece_at(knots, time)
-    h = np.diff(knots)[k][:, None]
-    s = (time - knots[k])[:, None] / np.where(h > 0.0, h, 1.0)
-    rise = y[k + 1] - y[k]
-    v0, v1 = h * rates[k], h * rates[k + 1]
-    return y[k] + s * (v0 + s * (3.0 * rise - 2.0 * v0 - v1 + s * (v0 + v1 - 2.0 * rise)))

@@ -7,7 +7,6 @@ process for any step. The input is white standard-normal samples, so that the ca
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 
@@ -54,7 +53,6 @@ def dryden_gust(white: Floats, step: float, tau: float) -> Floats:
     return z1
 
 
-@lru_cache(8)
 def _shares(s: float) -> tuple[float, float, float]:
     """Shares of the first white sample in z1 and z2, and of the second one in z2: the lower root of P - A P A^T.
 
@@ -107,9 +105,8 @@ def spline_coefficients(samples: Floats, scale: float = 1.0, part: int | None = 
     return table.reshape(n + 2, *shape)
 
 
-@lru_cache(8)
 def _elimination(n: int) -> tuple[Floats, Floats]:
-    """Factors (n,) of the row before in either sweep of the elimination, and shares (n,) of the samples; read-only.
+    """Factors (n,) of the row before in either sweep of the elimination, and shares (n,) of the samples.
 
     Both ends are known: their factors are zero, and their shares one.
     """
@@ -120,5 +117,4 @@ def _elimination(n: int) -> tuple[Floats, Floats]:
         pivot = 1.0 / (4.0 - pivot)
         factors[k] = -pivot
     shares[1:-1] = -6.0 * factors[1:-1]
-    factors.flags.writeable = shares.flags.writeable = False
     return factors, shares

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,20 +47,13 @@ class FreeSpace(NamedTuple):
     obstacles: Sequence[Obstacle]
     fence: Floats
 
-    @property
-    def has_fence(self) -> bool:
-        """Whether there is a geofence."""
-        return bool(np.isfinite(self.fence).any())
-
     def room(self, r: Floats, radius: Floats, most: Floats | float = np.inf) -> Floats:
         """Least distance (..., M) [m] of balls at r (..., M, 3) to an obstacle, or of their centres to the fence.
 
         Beyond ``most`` (..., M) [m] the distance does not matter.
         """
         least = self.room_beside_obstacles(r, radius, most)
-        if self.has_fence:
-            least = np.minimum(least, np.minimum(r - self.fence[0], self.fence[1] - r).min(axis=-1))
-        return least
+        return np.minimum(least, np.minimum(r - self.fence[0], self.fence[1] - r).min(axis=-1))
 
     def room_beside_obstacles(self, r: Floats, radius: Floats, most: Floats | float) -> Floats:
         """The same from obstacles alone."""
@@ -72,7 +65,7 @@ class FreeSpace(NamedTuple):
         Coordinates along a straight way are between those of its ends, however near the fence it runs. A path on the
         spot is the same wherever it is: it is looked at once, as finely as halvings would.
         """
-        if not self.has_fence:  # nothing is looked at: that took half of a search
+        if not np.isfinite(self.fence).any():  # nothing is looked at: that took half of a search
             return np.ones(len(a), dtype=np.bool_)
         parts = 2**_HALVINGS
         offsets, off = path((np.arange(parts) + 0.5) / parts), ways[:, None] / (2.0 * parts)
@@ -195,13 +188,8 @@ def _coordinates(common: Floats, spans: Floats, above: float, below: float) -> F
 def _extent(thing: Obstacle, frame: Floats) -> Floats:
     """Lowest and highest coordinates (2, 3) [m] of an obstacle along the axes of a frame."""
     solid, ends = thing.solid, records.extent(thing.solid)
-    if np.array_equal(frame, np.eye(3)):
-        return ends
     if not np.isfinite(ends).all():
-        upright = np.array_equal(frame[2], [0.0, 0.0, 1.0])
-        wide = np.array([[-np.inf] * 3, [np.inf] * 3])
-        wide[:, 2] = ends[:, 2] if upright else wide[:, 2]
-        return wide
+        return ends  # all that is below a height, whatever the frame's yaw
     turned = solid._replace(
         turn=solid.turn @ frame.T, origin=solid.origin @ frame.T, turned=np.ones(1, dtype=np.int64)
     )
@@ -225,22 +213,15 @@ class Roadmap:
 
     def __init__(
         self, space: FreeSpace, layers: list[Layer], changes: list[Change], radius: Floats, need: float,
-        frames: list[Floats], common: list[list[Floats]], known: dict[Any, Lattice],
+        frames: list[Floats], common: list[list[Floats]],
     ) -> None:  # fmt: skip
-        """Build the lattices; the parameters are those of `Lattice`, for each layer and frame.
-
-        ``known`` has the lattices of networks before, in the same space and of the same need, and gets the new ones.
-        """
+        """Build the lattices; the parameters are those of `Lattice`, for each layer and frame."""
         self.space, self.layers, self.changes = space, layers, changes
         self.radius, self.need = radius, need
-        every = [
-            [(f, layer.formation, layer.angles) for layer in layers] for f in range(len(frames))
+        self.lattices = [
+            [Lattice(space, layer, radius, need, frame, even) for layer in layers]
+            for frame, even in zip(frames, common, strict=True)
         ]
-        for keys, frame, even in zip(every, frames, common, strict=True):
-            for key, layer in zip(keys, layers, strict=True):
-                if key not in known:
-                    known[key] = Lattice(space, layer, radius, need, frame, even)
-        self.lattices = [[known[key] for key in keys] for keys in every]
         counts = [[len(x.points) for x in row] for row in self.lattices]
         starts = np.cumsum([0, *np.ravel(counts)])
         self.first = starts[:-1].reshape(len(frames), len(layers))

@@ -27,7 +27,6 @@ from rigidfleet.planning.reference import (
     Pose,
     align_slots,
     copy_with,
-    nearest_rotation,
     pose_at,
     reference_kind,
 )
@@ -269,7 +268,7 @@ def _attach_frame(
         # The new axes in the old ones: `axes` maps vectors from new to old.
         free = mission.free_attitude(phase)
         if free:
-            axes = nearest_rotation(slots, target, masses) if turn is None else turn
+            axes = rigid_body.kabsch(slots, target, masses) if turn is None else turn
         else:
             attitude = mission.establish_attitude(establishing, goal.T if goal.named else None)
             steady = now.pose is not None and goal.named and np.array_equal(goal.T, attitude)

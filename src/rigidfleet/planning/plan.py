@@ -233,7 +233,7 @@ def plan_phase(
         d1 = now.reference.values_of(edges, d1)
     reference = leg.reference
     if shaping is not None or now.blend is None:
-        d0 = now.reference.values_of(edges, lambda: distance_geometry.distances(now.r, edges))
+        d0 = now.reference.values_of(edges, distance_geometry.distances(now.r, edges))
         # Distances are those of the slots where these have the lengths commanded.
         agree = shaping is None and phase.control == "tracking" and _agree(d1, reference.p0, edges)
         reference = reference._replace(kind=SHAPE if agree else reference.kind, d0=d0, d1=d1)
@@ -247,8 +247,9 @@ def plan_phase(
     problem = Problem(
         body_formulation=mission.formulation == "body",
         has_frame=leg.frame is not None,
-        vehicles=_vehicles(
-            masses.tobytes(), mission.fleet.thrust_limit.tobytes(), mission.agents.saturate, mission.gravity
+        vehicles=Vehicles(
+            masses, 1.0 / masses, float(masses.sum()), float(masses.mean()), mission.fleet.thrust_limit.copy(),
+            mission.agents.saturate, mission.gravity,
         ),
         graph=_graph(edges.tobytes(), masses.tobytes(), large=method != "dense"),
         law=_law(
@@ -318,13 +319,6 @@ def _refuse(mission: Mission, phase: Phase, start: float, edges: Ints) -> None:
 
 
 @lru_cache(64)
-def _vehicles(masses: bytes, limit: bytes, saturate: bool, gravity: float) -> Vehicles:
-    """The vehicles, cached because they are the same in all phases."""
-    m, most = (np.frombuffer(x).copy() for x in (masses, limit))
-    return Vehicles(m, 1.0 / m, float(m.sum()), float(m.mean()), most, saturate, gravity)
-
-
-@lru_cache(64)
 def _graph(edges: bytes, masses: bytes, *, large: bool) -> Graph:
     """The constraint graph, cached because most phases have the same one as the phase before."""
     pairs = np.frombuffer(edges, dtype=np.int64).reshape(-1, 2).copy()
@@ -340,18 +334,9 @@ def _formation_in_shape(mission: Mission, name: str | None, now: PhaseState) -> 
     slots, r = slots[left], now.r[left]
     if len(slots) < 2:
         return None
-    pairs, wanted, most = _pair_lengths(slots.tobytes())
-    off = np.abs(distance_geometry.distances(r, pairs) - wanted)
-    return name if (off <= most).all() else None
-
-
-@lru_cache(16)
-def _pair_lengths(slots: bytes) -> tuple[Ints, Floats, float]:
-    """All pairs of slots (N, 3), their distances [m], and the greatest error [m] at which they count as held."""
-    places = np.frombuffer(slots).reshape(-1, 3)
-    pairs = graphs.complete_graph(len(places))
-    wanted = distance_geometry.distances(places, pairs)
-    return pairs, wanted, _NEAR * float(wanted.min())
+    pairs = graphs.complete_graph(len(slots))
+    wanted, lengths = (distance_geometry.distances(x, pairs) for x in (slots, r))
+    return name if (np.abs(lengths - wanted) <= _NEAR * wanted.min()).all() else None
 
 
 def _agree(lengths: Floats, slots: Floats, edges: Ints) -> bool:
@@ -378,8 +363,7 @@ def _law(mission: Mission, mu: float, *, damped: bool) -> ConstraintLaw:
 
 def _control(mission: Mission, phase: Phase, masses: Floats) -> Control:
     kind = {"open": OPEN, "tracking": TRACKING, "body": BODY}[phase.control]
-    force = np.empty((len(masses), 3))
-    force[:] = phase.input_force
+    force = np.tile(np.array(phase.input_force, dtype=float), (len(masses), 1))
     force[:, 2] += masses * mission.gravity
     allocation = mission.allocation
     method = RIGID if allocation.method == "rigid" else SPLITS[allocation.torque_split]

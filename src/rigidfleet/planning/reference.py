@@ -5,13 +5,11 @@ Both the plan of a flight and the check before it use them. Nothing here integra
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from rigidfleet._common.arrays import arrays_equal
 from rigidfleet.formation import distance_geometry
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import attitude as att
@@ -29,34 +27,19 @@ class ByEdge:
     edges: Ints = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     values: Floats = field(default_factory=lambda: np.zeros(0))
 
-    def values_of(self, edges: Ints, other: Floats | float | Callable[[], Floats]) -> Floats:
-        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges, or (B, m), then of so many flights.
-
-        A function of ``other`` values is called only where edges may be new.
-        """
-        if self._has(edges) and not (isinstance(other, np.ndarray) and other.ndim > 1):
-            return self.values.copy()
-        new = other if isinstance(other, np.ndarray | float | int) else other()
-        if not len(self.edges):
-            return np.zeros(len(edges)) + new
+    def values_of(self, edges: Ints, other: Floats | float) -> Floats:
+        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges, or (B, m), then of so many flights."""
         keys, own = _keys(edges), _keys(self.edges)
         order = np.argsort(own)
-        at = np.searchsorted(own, keys, sorter=order)
-        at = np.append(order, len(order))[at]
+        at = np.append(order, len(order))[np.searchsorted(own, keys, sorter=order)]
         known = np.append(own, -1)[at] == keys
-        return np.where(known, np.append(self.values, 0.0)[at], new)
+        return np.where(known, np.append(self.values, 0.0)[at], other)
 
     def with_values(self, edges: Ints, values: Floats) -> ByEdge:
         """These values, updated with the ``values`` of edges (m, 2), i < j."""
-        if not len(self.edges) or self._has(edges):
-            return ByEdge(edges, values.copy())
         edges = np.concatenate([edges, self.edges])
         first = np.unique(_keys(edges), return_index=True)[1]
         return ByEdge(edges[first], np.concatenate([values, self.values])[first])
-
-    def _has(self, edges: Ints) -> bool:
-        """Whether these are its edges, in the same order: most phases have those of the phase before."""
-        return arrays_equal(edges, self.edges)
 
 
 def _keys(edges: Ints) -> Ints:
@@ -132,10 +115,13 @@ class PhaseState:
     # Velocity, acceleration, jerk (3, N, 3) of the slots about the CM, body axes, if an abort has ended a phase.
     rates: Floats | None = None
 
-
-def nearest_rotation(before: Floats, after: Floats, masses: Floats) -> Floats:
-    """The rotation (3, 3) that brings slots (N, 3) nearest to those before: Kabsch, weighted by mass."""
-    return rigid_body.kabsch(before, after, masses)
+    @property
+    def attached(self) -> tuple[Pose, Pose, Floats]:
+        """Pose, goal and slots of a state with the frame attached: no phase that moves, or tracks slots, lacks them."""
+        assert self.pose is not None
+        assert self.goal is not None
+        assert self.slots is not None
+        return self.pose, self.goal, self.slots
 
 
 def reference_kind(
@@ -157,13 +143,6 @@ def reference_kind(
         return "squares"
     edges = mission.formation_edges(phase.formation)
     lengths = mission.formation_distances(phase.formation)
-    return _leading_kind(before, target, edges, lengths)
-
-
-def _leading_kind(
-    before: Floats, target: Floats, edges: Ints, lengths: Floats
-) -> Literal["shape", "squares"]:
-    """Kind of reference that leads from slots to others, whose edges have lengths (m,) [m] asked for."""
     if not np.allclose(distance_geometry.distances(target, edges), lengths, rtol=1e-3):
         return "squares"
     start, goal = rigid_body.centred(before), rigid_body.centred(target)
@@ -184,5 +163,5 @@ def align_slots(
     straight blend then has no angular momentum in its own frame, and moves the agents least. During the blend the
     slots rotate back, so that the body axes keep their meaning; distances are not affected.
     """
-    R = nearest_rotation(before, after, masses) if turn is None else turn
+    R = rigid_body.kabsch(before, after, masses) if turn is None else turn
     return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T

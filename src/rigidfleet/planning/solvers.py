@@ -7,7 +7,7 @@ agents suffice (`rigidfleet.kernel.elimination`). Other large systems are solved
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -94,21 +94,6 @@ def _steps(n: int, data: bytes) -> Ints | None:
                 if degree[j] == 3 or (degree[j] < 3 and not taken[j]):
                     ready.append(j)
     return steps if at == 0 else None
-
-
-class Dissection:
-    """`dissection` of points (N, 3) with edges (m, 2), found when it is first called."""
-
-    def __init__(self, points: Floats, edges: Ints) -> None:
-        self.points, self.edges = points, edges
-
-    def __call__(self) -> Ints:
-        """The order (N,)."""
-        return self._order
-
-    @cached_property
-    def _order(self) -> Ints:
-        return dissection(self.points, self.edges)
 
 
 def dissection(points: Floats, edges: Ints, leaf: int = 16) -> Ints:

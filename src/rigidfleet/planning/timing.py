@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 from rigidfleet._common.progress import report
-from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.findings import Keys
 from rigidfleet.mission.values import AUTO
@@ -95,7 +94,12 @@ def complete_times(mission: Mission) -> Mission:
             changed = leg.phase.model_dump(mode="json", include={*phase.automatic, "through"})
             tables[k] = tables[k] | {key: x for key, x in changed.items() if x or key != "through"}
         if not leg.known:
-            raise _error_of_reference(mission, k, mission.phases[last])
+            problem = "depends on distances alone, so that the starts of later phases are known only in flight"
+            name = None if phase.shaping is None else phase.shaping.formation
+            remedy = (
+                f"give the formation a shape or slots, or give '{mission.phases[last].name}' a time"
+            )
+            raise ways.error_of_key(mission, k, "formation", name, problem, remedy)
         now = leg.after
     return mission.with_phases(tables)
 
@@ -247,13 +251,3 @@ def _with_point_times(mission: Mission, phase: Phase, departure: Departure) -> P
         for at, point in zip(phase.points, points, strict=True)
     )
     return phase.model_copy(update={"through": through})
-
-
-def _error_of_reference(mission: Mission, number: int, last: Phase) -> MissionError:
-    problem = (
-        "depends on distances alone, so that the starts of later phases are known only in flight"
-    )
-    remedy = f"give the formation a shape or slots, or give '{last.name}' a time"
-    shaping = mission.phases[number].shaping
-    name = None if shaping is None else shaping.formation
-    return ways.error_of_key(mission, number, "formation", name, problem, remedy)

@@ -53,14 +53,6 @@ class Transfer(NamedTuple):
     duration: float
     certificate: Certificate
 
-    def pieces(self) -> Piecewise:
-        """The ways as cubics (M, N, 3, 4) between knots (M + 1,) [s]."""
-        return Piecewise.b_spline(self.control, self.duration)
-
-    def at(self, time: ArrayLike) -> Floats:
-        """Positions (K, N, 3) [m] at times (K,) [s] from the start; at rest before and after."""
-        return self.pieces().at(np.clip(time, 0.0, self.duration))
-
 
 def least_duration(
     start: ArrayLike, goal: ArrayLike, speed: ArrayLike, acceleration: ArrayLike

@@ -120,15 +120,12 @@ def _stagger(
         groups = [[i for i in moving if row[i] == k] for k in sorted(set(row.values()))]
     travel = round(phase.duration - (len(groups) - 1) * phase.stagger, 6)
     if not 0.0 < travel <= phase.stagger + 1e-6:
-        problem = (
-            f"leaves {travel:g} s to each of {len(groups)} groups, {phase.stagger:g} s apart"
-            if travel > 0
-            else f"is too short for {len(groups)} groups, {phase.stagger:g} s apart"
+        what = f"leaves {travel:g} s to each of" if travel > 0 else "is too short for"
+        problem, whole = (
+            f"{what} {len(groups)} groups, {phase.stagger:g} s apart",
+            len(groups) * phase.stagger,
         )
-        remedy = (
-            f"groups go one after another: give a duration of {len(groups) * phase.stagger:g} s, or up to"
-            f" {phase.stagger:g} s less"
-        )
+        remedy = f"groups go one after another: give a duration of {whole:g} s, or up to {phase.stagger:g} s less"
         raise error_of_key(mission, number, "duration", phase.duration, problem, remedy)
     common = {key: x for key, x in table.items() if key not in ("stagger", "by")}
     return [
@@ -238,15 +235,13 @@ def _with_ways(
     room = _ROOM * below
     low, high = np.minimum(p, q).min(axis=0), np.maximum(p, q).max(axis=0)
     # Slots that are outside already are for the plan's check to find.
-    box = (
-        np.maximum(low - room, np.minimum(within[0], low)),
-        np.minimum(high + room, np.maximum(within[1], high)),
-    )
+    lowest = np.maximum(low - room, np.minimum(within[0], low))
+    highest = np.minimum(high + room, np.maximum(within[1], high))
     each = 1.0 / np.sqrt(3.0)  # limits of each axis, which together keep those of the vector
     try:
         ways = transfer(
             p, q, distance=distance, speed=each * limits.speed, acceleration=each * limits.acceleration,
-            box=box, downwash=below / distance,
+            box=(lowest, highest), downwash=below / distance,
         )  # fmt: skip
     except ValueError as error:
         problem = f"between '{before}' and '{phase.formation}', {error}"

@@ -344,16 +344,14 @@ class TickTables:
         dropped = np.zeros((0, self.n), dtype=np.bool_)
         if self.noise is not None:
             # Which multiples of the ticks between measurements lie there.
-            rows, seed = (
-                range(-(-first // sensing.every), -(-last // sensing.every)),
-                self.noise.seed,
-            )
+            rows = range(-(-first // sensing.every), -(-last // sensing.every))
             if self.noise.position or self.noise.velocity:
-                white = _random_rows(_NOISE, seed, rows, (2, self.n, 3))
+                white = _random_rows(_NOISE, self.noise.seed, rows, (2, self.n, 3))
                 noise_r = np.ascontiguousarray(self.noise.position * white[:, 0])
                 noise_v = np.ascontiguousarray(self.noise.velocity * white[:, 1])
             if self.noise.dropped:
-                dropped = _random_rows(_DROPPED, seed, rows, (self.n,)) < self.noise.dropped
+                uniform = _random_rows(_DROPPED, self.noise.seed, rows, (self.n,))
+                dropped = uniform < self.noise.dropped
         made = fleet.TickInputs(first, last, path, yaw, jerk, snap, noise_r, noise_v, dropped)
         if tau is None:
             return made

@@ -24,7 +24,7 @@ from rigidfleet.mission.kinds import ANGLES, Go
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import layers
 from rigidfleet.planning.clearance import closest, speed_bounds
-from rigidfleet.planning.lattice import FreeSpace, Lattice, Layer, Roadmap, Way, constant_path
+from rigidfleet.planning.lattice import FreeSpace, Layer, Roadmap, Way, constant_path
 from rigidfleet.planning.legs import Leg, latest_end, state_at_start
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
 from rigidfleet.planning.reference import PhaseState
@@ -145,7 +145,6 @@ class _Search:
     def _cheapest_way(self, need: float) -> tuple[Roadmap, Way]:
         """The way of least cost among shapes: more shapes, and then more yaws, as long as there is no short one."""
         best: tuple[Roadmap, Way] | None = None
-        known: dict[Any, Lattice] = {}
         straight = float(np.linalg.norm(self.end - self.begin))
         stages = sorted({s.stage for s in self.shapes})
         for stage, more in [*((k, False) for k in stages), (stages[-1], True)]:
@@ -155,7 +154,7 @@ class _Search:
             report(
                 f"looking for a way of '{self.phase.name}' round obstacles, shapes: {len(shapes)}"
             )
-            roadmap = self._roadmap(shapes, need, known, more=more)
+            roadmap = self._roadmap(shapes, need, more=more)
             way = roadmap.shortest((self.begin, 0), (self.end, self._last))
             if way is not None and (best is None or way.cost < best[1].cost):
                 best = roadmap, way
@@ -165,9 +164,7 @@ class _Search:
             raise self._no_way_error(roadmap)
         return best[0], best[0].shorten(best[1])
 
-    def _roadmap(
-        self, shapes: list[layers.CandidateShape], need: float, known: dict[Any, Lattice], *, more: bool
-    ) -> Roadmap:  # fmt: skip
+    def _roadmap(self, shapes: list[layers.CandidateShape], need: float, *, more: bool) -> Roadmap:
         frames = layers.lattice_axes(self._near_obstacles())
         fence = self.mission.limits.geofence
         box = np.array([[-np.inf] * 3, [np.inf] * 3])
@@ -202,7 +199,7 @@ class _Search:
         if not self.each:  # the one ball that covers all neither turns nor changes
             stays = constant_path(nodes[0])
             changes = [c._replace(path=stays, ways=np.zeros(1)) for c in changes]
-        return Roadmap(space, nodes, changes, self.radius, need, frames, common, known)
+        return Roadmap(space, nodes, changes, self.radius, need, frames, common)
 
     # -- from nodes to phases --------------------------------------------------------------------------
 
@@ -291,14 +288,9 @@ class _Search:
     def _missing_clearance(self, mission: Mission, leg: Leg) -> float:
         """How much [m] the clearance of a planned leg is below what is asked for; negative if it is kept."""
         planned = planned_phase(leg, max(samples_per_phase(mission), FEWEST_SAMPLES))
-        low, high = planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))
         speed, need, radius = speed_bounds(planned), self.phase.clearance, mission.fleet.radius
         least = math.inf
         for thing in mission.obstacles:
-            a, b = extent(thing.solid)
-            beside = np.maximum(np.maximum(a - high, low - b), 0.0)
-            if np.linalg.norm(beside) - radius.max() > min(least, need + 1.0):
-                continue
             clearance, agent, time, proved = closest(planned, thing, radius, speed)
             if proved < least:
                 least = proved

@@ -78,10 +78,8 @@ class Rigidity:
     @property
     def rigid(self) -> bool:
         """Whether the distances are known to hold the shape against every small motion."""
-        return self.rigidity_class in (
-            RigidityClass.INFINITESIMALLY_RIGID,
-            RigidityClass.PRESTRESS_STABLE,
-        )
+        held = RigidityClass.INFINITESIMALLY_RIGID, RigidityClass.PRESTRESS_STABLE
+        return self.rigidity_class in held
 
     @property
     def own(self) -> Rigidity:

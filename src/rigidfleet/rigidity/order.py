@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.rigidity.framework import Framework, sparse_flexes
 from rigidfleet.typing import Floats, Ints
 
@@ -209,25 +208,48 @@ def _follow_flex(frame: Framework, direction: Floats) -> Floats | None:
 
 
 def restore_lengths(p: Floats, edges: Ints, lengths: Floats, tol: float) -> Floats | None:
-    """Points near p (N, d) whose edges have the given lengths within tol [m], or None.
+    """Points near p (N, d) whose edges have the given lengths within tol [m], or None."""
+    ends, reached = descend_to_lengths(p[None], edges, lengths, tol, 40)
+    return ends[0] if reached[0] else None
 
-    Levenberg-Marquardt with the error itself as damping, which converges quadratically even if J loses rank
-    along the solutions (Yamashita and Fukushima, 2001).
-    """
-    e = edges
-    for _ in range(40):
-        L = np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
-        c = L - lengths
-        if np.abs(c).max(initial=0.0) <= tol:
-            return p
-        if not (L > 0).all():
-            return None
-        J = jacobian(p, e)
-        damping = 0.3 * np.linalg.norm(c) / lengths.mean()
-        K = J.T @ J
-        K[np.diag_indices_from(K)] += damping
-        p = p - np.linalg.solve(K, J.T @ c).reshape(p.shape)
-    return None
+
+def descend_to_lengths(
+    at: Floats, e: Ints, length: Floats, tol: float, iterations: int
+) -> tuple[Floats, np.ndarray]:
+    """Levenberg-Marquardt from positions (B, N, d): final positions, and which of them have the lengths within tol."""
+    at = at.copy()
+    count, n, d = at.shape
+    ends, done = at.copy(), np.zeros(count, dtype=bool)
+    damping = np.full(count, 1e-2)
+    i, j = e.T
+    rows, size = np.arange(len(e)), d * n
+    lane = np.arange(count)
+    c = _length_errors(at, i, j, length)
+    for _ in range(iterations):
+        x = (at[:, i] - at[:, j]) / length[:, None]
+        J = np.zeros((len(at), len(e), n, d))
+        J[:, rows, i], J[:, rows, j] = x, -x
+        J = J.reshape(len(at), len(e), size)
+        K = J.transpose(0, 2, 1) @ J
+        K[:, np.arange(size), np.arange(size)] += damping[:, None] + 1e-14
+        step = np.linalg.solve(K, (J.transpose(0, 2, 1) @ c[..., None]))[..., 0]
+        new = at - step.reshape(at.shape)
+        after = _length_errors(new, i, j, length)
+        better = (after**2).sum(axis=1) < (c**2).sum(axis=1)
+        at, c = np.where(better[:, None, None], new, at), np.where(better[:, None], after, c)
+        damping = np.where(better, damping * 0.2, np.minimum(damping * 4, 1e6))
+        met = np.abs(c).max(axis=1) <= tol
+        ends[lane], done[lane] = at, met
+        go_on = ~met & (damping < 1e6)
+        at, c, damping, lane = at[go_on], c[go_on], damping[go_on], lane[go_on]
+        if not len(at):
+            break
+    return ends, done
+
+
+def _length_errors(p: Floats, i: Ints, j: Ints, length: Floats) -> Floats:
+    """(L^2 - d^2) / (2 d) [m], which is smooth if agents meet, and equals L - d near the solution."""
+    return (((p[:, i] - p[:, j]) ** 2).sum(axis=2) - length**2) / (2 * length)
 
 
 def are_joined(frame: Framework, goal: Floats, strides: int) -> bool:

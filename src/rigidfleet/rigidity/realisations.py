@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet.rigidity.analysis import RigidityClass, as_framework, classify, flatten
 from rigidfleet.rigidity.framework import Framework
-from rigidfleet.rigidity.order import STRIDES, align, are_joined
+from rigidfleet.rigidity.order import STRIDES, align, are_joined, descend_to_lengths
 from rigidfleet.typing import Floats, Ints
 
 #: Shapes whose all-pairs distances differ by less than this share of their size count as equal.
@@ -149,7 +149,7 @@ def realisations(
     share = max(1, int(1e7 / (len(e) * 3 * n)))  # starts whose Jacobians fit into 80 MB
     for first in range(0, starts, share):
         some = at[first : first + share]
-        ends, reached = _descend(some, e, length, _REACHED * size, iterations)
+        ends, reached = descend_to_lengths(some, e, length, _REACHED * size, iterations)
         converged += int(reached.sum())
         for end in ends[reached]:
             groups.add(end, 1)
@@ -252,44 +252,5 @@ def follow_lengths(
             between = start + (goal - start) * (k / steps)
             squares = ((between[e[:, 0]] - between[e[:, 1]]) ** 2).sum(axis=1)
         wanted = np.sqrt(np.maximum(squares, (1e-3 * length) ** 2))
-        at, reached = _descend(at, e, wanted, tol, 8 if k < steps else 300)
+        at, reached = descend_to_lengths(at, e, wanted, tol, 8 if k < steps else 300)
     return at[0] if reached[0] else None
-
-
-def _descend(
-    at: Floats, e: Ints, length: Floats, tol: float, iterations: int
-) -> tuple[Floats, np.ndarray]:
-    """Levenberg-Marquardt from positions (B, N, d): final positions, and which of them have the lengths within tol."""
-    at = at.copy()
-    count, n, d = at.shape
-    ends, done = at.copy(), np.zeros(count, dtype=bool)
-    damping = np.full(count, 1e-2)
-    i, j = e.T
-    rows, size = np.arange(len(e)), d * n
-    lane = np.arange(count)
-    c = _length_errors(at, i, j, length)
-    for _ in range(iterations):
-        x = (at[:, i] - at[:, j]) / length[:, None]
-        J = np.zeros((len(at), len(e), n, d))
-        J[:, rows, i], J[:, rows, j] = x, -x
-        J = J.reshape(len(at), len(e), size)
-        K = J.transpose(0, 2, 1) @ J
-        K[:, np.arange(size), np.arange(size)] += damping[:, None] + 1e-14
-        step = np.linalg.solve(K, (J.transpose(0, 2, 1) @ c[..., None]))[..., 0]
-        new = at - step.reshape(at.shape)
-        after = _length_errors(new, i, j, length)
-        better = (after**2).sum(axis=1) < (c**2).sum(axis=1)
-        at, c = np.where(better[:, None, None], new, at), np.where(better[:, None], after, c)
-        damping = np.where(better, damping * 0.2, np.minimum(damping * 4, 1e6))
-        met = np.abs(c).max(axis=1) <= tol
-        ends[lane], done[lane] = at, met
-        go_on = ~met & (damping < 1e6)
-        at, c, damping, lane = at[go_on], c[go_on], damping[go_on], lane[go_on]
-        if not len(at):
-            break
-    return ends, done
-
-
-def _length_errors(p: Floats, i: Ints, j: Ints, length: Floats) -> Floats:
-    """(L^2 - d^2) / (2 d) [m], which is smooth if agents meet, and equals L - d near the solution."""
-    return (((p[:, i] - p[:, j]) ** 2).sum(axis=2) - length**2) / (2 * length)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,9 +40,8 @@ def workspace_and_solver(
         steps = solvers.elimination_steps(len(points), edges)
         order = None if steps is None else ordering.prepare_order(steps, plan.problem.graph.edges)
     axes = plan.problem.has_frame or plan.problem.law.k_def > 0.0
-    solver = large_solver(
-        plan.problem, Setup(order, solvers.Dissection(points, edges), *plan.residual(), axes)
-    )
+    dissect = cache(partial(solvers.dissection, points, edges))
+    solver = large_solver(plan.problem, Setup(order, dissect, *plan.residual(), axes))
     plan.problem = problem_with_solver(solver, plan.problem)
     return solver.workspace, solver
 

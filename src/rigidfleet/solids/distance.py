@@ -35,6 +35,13 @@ def floor(x: Numbers) -> Any:
     return np.floor(x).astype(np.int64)
 
 
+def choose(test: Numbers, these: Any, others: Any) -> Any:
+    """Four numbers where the test holds, four others elsewhere."""
+    a, b, c, d = these
+    i, j, k, m = others
+    return where(test, a, i), where(test, b, j), where(test, c, k), where(test, d, m)
+
+
 # -- boxes, balls, half spaces -------------------------------------------------------------------------
 
 
@@ -118,12 +125,16 @@ def edge_side(x: Numbers, y: Numbers, z: Numbers, a: Any, b: Any, normal: Any) -
     return (v * z - w * y) * normal[0] + (w * x - u * z) * normal[1] + (u * y - v * x) * normal[2]
 
 
+def facet_normal(t: Any) -> Any:
+    """Normal of a triangle (3, 3), twice as long as its area is large."""
+    e, f, g = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
+    p, q, r = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
+    return f * r - g * q, g * p - e * r, e * q - f * p
+
+
 def triangle_to_point(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
     """Vector from the nearest point of a triangle (3, 3) to the point, and its squared length."""
-    a, b, c = t[0], t[1], t[2]
-    e, f, g = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    p, q, r = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-    n = (f * r - g * q, g * p - e * r, e * q - f * p)
+    a, b, c, n = t[0], t[1], t[2], facet_normal(t)
     area = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
     i, j, k = segment_to_point(x, y, z, a, b)
     best = i * i + j * j + k * k
@@ -131,22 +142,13 @@ def triangle_to_point(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
         u, v, w = segment_to_point(x, y, z, t[m], t[(m + 1) % 3])
         d = u * u + v * v + w * w
         nearer = d < best
-        i, j, k, best = (
-            where(nearer, u, i),
-            where(nearer, v, j),
-            where(nearer, w, k),
-            where(nearer, d, best),
-        )
+        i, j, k, best = choose(nearer, (u, v, w, d), (i, j, k, best))
     if area > 0.0:
         over = edge_side(x, y, z, a, b, n) >= 0.0
         over = over & (edge_side(x, y, z, b, c, n) >= 0.0) & (edge_side(x, y, z, c, a, n) >= 0.0)
         height = ((x - a[0]) * n[0] + (y - a[1]) * n[1] + (z - a[2]) * n[2]) / area
-        i, j, k = (
-            where(over, height * n[0], i),
-            where(over, height * n[1], j),
-            where(over, height * n[2], k),
-        )
-        best = where(over, height * height * area, best)
+        straight = (height * n[0], height * n[1], height * n[2], height * height * area)
+        i, j, k, best = choose(over, straight, (i, j, k, best))
     return i, j, k, best
 
 
@@ -171,8 +173,7 @@ def surface_to_point(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
         for m in range(s.leaf[node, 0], s.leaf[node, 1]):
             u, v, w, d = triangle_to_point(x, y, z, s.triangles[m])
             nearer = d < best
-            i, j, k = where(nearer, u, i), where(nearer, v, j), where(nearer, w, k)
-            best = where(nearer, d, best)
+            i, j, k, best = choose(nearer, (u, v, w, d), (i, j, k, best))
         node += 1
     return i, j, k, best
 
@@ -194,15 +195,7 @@ def height_map_point(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
 
 def is_inside(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     """Whether the point is inside a solid of triangles: a convex hull or a height map."""
-    size = s.size[b]
-    inside = (
-        (x >= size[0])
-        & (x <= size[3])
-        & (y >= size[1])
-        & (y <= size[4])
-        & (z >= size[2])
-        & (z <= size[5])
-    )
+    inside = box_distance(x, y, z, s.size[b]) <= 0.0
     if not any_true(inside):
         return inside
     if s.kind[b] == HEIGHTS:
@@ -210,13 +203,8 @@ def is_inside(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
         return inside & (z <= height)
     for m in range(s.first[b, 1], s.last[b, 1]):
         t = s.triangles[m]
-        e, f, g = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
-        p, q, r = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
-        out = (
-            (x - t[0, 0]) * (f * r - g * q)
-            + (y - t[0, 1]) * (g * p - e * r)
-            + (z - t[0, 2]) * (e * q - f * p)
-        )
+        n = facet_normal(t)
+        out = (x - t[0, 0]) * n[0] + (y - t[0, 1]) * n[1] + (z - t[0, 2]) * n[2]
         inside = inside & (out <= 0.0)
     return inside
 
@@ -250,12 +238,7 @@ def outward_normal(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     away = np.sqrt(squared)
     away = where(is_inside(x, y, z, b, s), -away, away)
     known = squared > 0.0
-    i, j, k, away = (
-        where(known, i, 0.0),
-        where(known, j, 0.0),
-        where(known, k, 0.0),
-        where(known, away, 1.0),
-    )
+    i, j, k, away = choose(known, (i, j, k, away), (0.0, 0.0, 0.0, 1.0))
     return i / away, j / away, k / away
 
 
@@ -346,7 +329,7 @@ def height_below(x: Numbers, y: Numbers, z: Numbers, s: Any) -> Numbers:
 
 #: The functions that the kernel compiles, each after those that it calls.
 ELEMENTWISE = (
-    box_distance, box_normal, cylinder_distance, cylinder_normal,
-    segment_to_point, edge_side, triangle_to_point, height_map_point, surface_to_point, is_inside,
+    choose, box_distance, box_normal, cylinder_distance, cylinder_normal,
+    segment_to_point, edge_side, facet_normal, triangle_to_point, height_map_point, surface_to_point, is_inside,
     signed_distance, outward_normal, displacement, is_present, own_axes, is_below, height_range, height_below,
 )  # fmt: skip

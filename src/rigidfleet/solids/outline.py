@@ -60,13 +60,8 @@ def _revolve(profile: Floats) -> Outline:
     """Surface of revolution about z of a profile (P, 2) of radii and heights, from below to above."""
     angle = np.linspace(0.0, 2 * np.pi, _SIDES + 1)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    rings = np.concatenate(
-        [
-            profile[:, None, :1] * circle,
-            np.broadcast_to(profile[:, None, 1:], (len(profile), _SIDES + 1, 1)),
-        ],
-        axis=2,
-    )
+    rings = np.empty((len(profile), _SIDES + 1, 3))
+    rings[..., :2], rings[..., 2] = profile[:, None, :1] * circle, profile[:, 1:]
     a, b, c, d = (
         x.reshape(-1, 3) for x in (rings[:-1, :-1], rings[:-1, 1:], rings[1:, 1:], rings[1:, :-1])
     )

@@ -97,9 +97,8 @@ def cylinder(ends: ArrayLike, radius: float) -> Form:
     z = (b - a) / length
     x = np.cross(np.eye(3)[int(np.abs(z).argmin())], z)
     x /= np.linalg.norm(x)
-    return Form(
-        CYLINDER, (a + b) / 2, np.array([x, np.cross(z, x), z]), [radius, length / 2, 0, 0, 0, 0]
-    )
+    turn = np.array([x, np.cross(z, x), z])
+    return Form(CYLINDER, (a + b) / 2, turn, [radius, length / 2, 0, 0, 0, 0])
 
 
 def hull(points: ArrayLike) -> Form:
