@@ -100,7 +100,7 @@ def passage(h: float) -> tuple[float, float, np.ndarray]:
         path.append(call.S[..., :3])
         S = state.S
         state.count[fleet.SAMPLES] = 0
-        y = np.concatenate([S[:, :3].ravel(), S[:, 3:6].ravel(), state.integral[0]])
+        y = np.concatenate([S[:, :3].ravel(), S[:, 3:6].ravel(), state.integral])
         now = plan.state_at_end(plan.t_end, y, work)
     return now.t, spent, np.concatenate(path)
 

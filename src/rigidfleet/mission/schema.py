@@ -126,7 +126,7 @@ class Autopilot(Part):
         True,
     )
     step: Annotated[float, Strict(), Field(ge=1e-5, le=0.01)] = key(
-        "longest step of the integrator, a fourth-order Runge-Kutta method [s]", 0.001
+        "longest step of the integrator, a fourth-order Runge-Kutta method [s]", 0.002
     )
 
 

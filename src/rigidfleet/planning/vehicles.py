@@ -41,6 +41,8 @@ _BLOCK = 1024
 _NOISE, _DROPPED, _LATE, _DRIFT = range(2, 6)
 #: Density of the air at sea level, ICAO standard atmosphere [kg/m^3].
 DENSITY = 1.225
+#: Longest step with a user's force [s]: with the velocity of the step's start, drag is met to .1 % of its effect.
+_FORCED = 0.001
 #: Speed below which the direction of quadratic drag is rounded off [m/s].
 _STILL = 0.1
 #: Share of the drag that its feedforward leaves in fast descents, where rotors turn slower than at the thrust desired.
@@ -62,7 +64,8 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
     n, autopilot, d = len(models), mission.autopilot, mission.disturbances
     made = [kernel_vehicle(model, m) for model, m in zip(models, mission.true_mass, strict=True)]
     # A force is held over each step: twenty of them meet a smooth pulse to 1 %
-    steps = max(1, math.ceil(1.0 / autopilot.rate / min(autopilot.step, max_step / 10.0) - 1e-9))
+    longest = min(autopilot.step, _FORCED if max_step < math.inf else math.inf, max_step / 10.0)
+    steps = max(1, math.ceil(1.0 / autopilot.rate / longest - 1e-9))
     flight = fleet.ideal_flight(
         fleet.quadrotors(made, mission.gravity),
         start=0.0,

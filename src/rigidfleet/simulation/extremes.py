@@ -466,7 +466,8 @@ class Extremes(CurveWatch):
             upright = np.where(rotors, state.worst[:, fleet.UPRIGHT], 1.0)
             angle = np.arccos(np.clip(upright, -1.0, 1.0))
             rows["tilt"] = angle, state.worst_time[:, fleet.UPRIGHT]
-        error = np.where(gone, -1.0, state.worst[:, fleet.ERROR])
+        # Where a flight grows beyond all bounds, its error is not known.
+        error = np.where(gone, -1.0, np.nan_to_num(state.worst[:, fleet.ERROR], posinf=-1.0))
         if error.max() > 0.0:
             rows["tracking_error"] = error, state.worst_time[:, fleet.ERROR]
         share = np.where(lost, 0.0, state.saturations / max(ticks, 1))

@@ -23,6 +23,7 @@ from rigidfleet.planning.derivatives import (
     slots_by_own_clocks,
     yaw_derivatives,
 )
+from rigidfleet.planning.vehicles import YawTurn, commanded_yaw, slots_and_yaw
 from rigidfleet.result import CLOSE, LATER, RECORDED, SEEN, Extremum, PhaseRecord, Result
 from rigidfleet.simulation.solver_setup import large_solver, problem_with_solver, workspace_of
 from rigidfleet.typing import Bools, Floats, Ints
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from rigidfleet.kernel.mail import Links, Mail
     from rigidfleet.kernel.problem import Motion, Problem, Reference, Workspace
     from rigidfleet.mission import Mission
-    from rigidfleet.planning.vehicles import YawTurn
 
 
 #: Greatest number of edges, or of coordinates, for which the smallest singular value of J is recorded.
@@ -336,9 +336,7 @@ def _references(
     Yaw "along" continues from piece to piece. Where vehicles have clocks of their own, ``tau`` says how these stand;
     the yaw is that by their mean, from which they differ by far less than a vehicle needs to turn.
     """
-    yaw, n = mission.yaw, mission.n_agents
-    x, y, z = yaw.point or (0.0, 0.0, 0.0)
-    turned = Yaw(yaw.kind, float(np.deg2rad(yaw.yaw_deg)), (x, y, z))
+    turned, n = commanded_yaw(mission), mission.n_agents
     states, angles = [], []
     last, until, end = None, 0.0, 0
     for times, followed in pieces:
@@ -388,8 +386,6 @@ def _yaw_of_turn(
     reference: Reference, motion: Motion, time: Floats, yaw: Yaw, turn: YawTurn
 ) -> Floats:
     """Yaw and its rate (K, 2, N) asked of vehicles that turn into it from the yaw they had."""
-    from rigidfleet.planning.vehicles import slots_and_yaw
-
     since = np.concatenate([[turn.begun], time])
     return slots_and_yaw(reference, motion, since, yaw, turn)[1][:2, :, 1:].transpose(2, 0, 1)
 
