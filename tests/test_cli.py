@@ -1103,7 +1103,13 @@ def test_progress_on_a_terminal(monkeypatch):
 def test_found_ways_are_written_once(tmp_path, capsys):
     """check --expand writes the mission with its ways, whole, and overwrites nothing unless forced."""
     file = tmp_path / "found.toml"
-    asked = ["check", "narrow-passage-found", "--no-realisations", "--expand", str(file)]
+    asked = [
+        "check",
+        "narrow-passage-found",
+        "--no-realisations",
+        "--expand",
+        str(file.with_suffix("")),
+    ]
     assert cli.main(asked) == 0
     written = file.read_text()
     assert 'kind = "go"' not in written

@@ -281,6 +281,24 @@ def test_an_offset_of_the_clock_is_recovered(plan: rf.Result) -> None:
     assert any("Positions alone do not tell a clock from a lag" in note for note in verdict.notes)
 
 
+@pytest.mark.parametrize(("turn", "scale"), [(180.0, 1.0), (-100.0, 1000.0), (170.0, 0.9)])
+def test_a_show_that_is_set_up_quite_wrong_is_told(turn: float, scale: float) -> None:
+    """The other way round, or in millimetres: turn and scale are found from any start, and the clock with them."""
+    t = np.linspace(0.0, 20.0, 201)
+    x = np.stack([4.0 * np.sin(0.5 * t), 3.0 * np.sin(0.3 * t), 5.0 + np.sin(t)], axis=1)
+    x = x[:, None] + np.array([[0.0, 0.0, 0.0], [6.0, 1.0, 0.0], [1.0, 5.0, 2.0]])
+    ways = [
+        Piecewise.hermite(t, np.stack([y, np.gradient(y, t, axis=0)])) for y in x.swapaxes(0, 1)
+    ]
+    z = np.exp(1j * np.radians(turn)) * (x[..., 0] + 1j * x[..., 1])
+    flown = scale * np.stack([z.real, z.imag, x[..., 2]], axis=2) + [3.0, 4.0, 0.0]
+    logs = [(t + 2.3, flown[:, i]) for i in range(3)]
+    known = align(logs, ways, "offset").to_dict()
+    assert known["offset_s"][0] == pytest.approx(2.3, abs=0.01)
+    assert (known["turn_deg"][0] - turn + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.1)
+    assert known["scale"][0] == pytest.approx(scale, rel=1e-3)
+
+
 def test_hovering_tells_no_clock() -> None:
     """Where nothing moves, the offset cannot be told."""
     random, t = np.random.default_rng(9), np.arange(0.0, 20.0, 0.05)

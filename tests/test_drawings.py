@@ -108,7 +108,8 @@ def test_what_is_not_drawn_is_said(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     rest = """<rect width="40" height="40" clip-path="url(#c)"/><image width="4"/><line x2="30"/>
     <g style="mask:url(#m)"><rect x="50" width="9" height="9"/></g><text>Hi <tspan>there</tspan></text>
-    <use href="other.svg#p"/><style>.a .b{fill:none}</style>"""
+    <use href="other.svg#p"/><style>.a .b{fill:none}</style>
+    <symbol id="s" refX="-5" viewBox="0 0 9 9"><path d="M0 0h9"/></symbol><use href="#s" fill="none"/>"""
     (tmp_path / "d.svg").write_text(VIEW.format(rest))
     asked = ["--formations", "d.svg", "--agents", "20", "--spacing", "2"]
     for show in ["--show"], []:
@@ -117,6 +118,7 @@ def test_what_is_not_drawn_is_said(tmp_path, monkeypatch, capsys):
         for said in (
             "clip-path is not followed",
             "mask is not followed",
+            "refX is not followed",
             "text 'Hi' is not drawn",
             "tspan 'there' is not drawn",
             "fill is drawn by its edge, without colour (2x)",

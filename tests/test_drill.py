@@ -436,6 +436,29 @@ def test_stale_files_are_flown(tmp_path):
     assert drilled.outcome(GeometricFault("stale", 2.0, np.array([5]), stream))[1] == ""
 
 
+def test_vehicles_of_files_keep_their_names(tmp_path):
+    """An earlier version in another order of its vehicles is the same, and the worst two are named."""
+    show, every = day(tmp_path, 2), np.arange(3)
+    head, *rows = (tmp_path / "show-2.csv").read_text().splitlines()
+    rows = [
+        f"{t},drone {100 - int(who)},{rest}" for t, who, rest in (row.split(",", 2) for row in rows)
+    ]
+    files = tmp_path / "named.csv", tmp_path / "again.csv"
+    for file, order in zip(files, (1, -1), strict=True):  # by time, each row of a time in an order
+        rows.sort(
+            key=lambda row, order=order: (
+                float(row.split(",")[0]),
+                order * int(row.split()[1].split(",")[0]),
+            )
+        )
+        file.write_text("\n".join([head, *rows]) + "\n")
+    drilled = Show(show.mission, Drill(files=(str(files[0]),), stale=(str(files[1]),)))
+    stream = np.random.default_rng(0)
+    assert drilled.outcome(GeometricFault("stale", 1.0, every, stream))[1] == ""
+    failed = drilled.outcome(GeometricFault("shifted", 1.3, every[:1], Known(np.array([0.0]), 1)))
+    assert re.search(r"agents? 1 \(drone \d+\)", failed[2])
+
+
 @pytest.mark.parametrize("kind", ["folder", "skyc"])
 def test_trajectories_of_others_are_drilled_by_the_command(kind, tmp_path, capsys, monkeypatch):
     """Folders of polynomials and shows are drilled by one command, which says of each fault what share fails."""

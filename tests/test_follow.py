@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import make_interp_spline
 
 import rigidfleet as rf
-from rigidfleet.foreign.curves import least_jerk_curve
+from rigidfleet.foreign.curves import curve_to_rows, least_jerk_curve
 from rigidfleet.kernel.problem import SHAPE, Reference
 from rigidfleet.kernel.references import blend_slots
 from rigidfleet.math.piecewise import Piecewise, join
@@ -368,3 +368,61 @@ def test_digests_of_files_stay_where_a_mission_is_rewritten(tmp_path):
     result = rf.simulate(path)
     assert "slots of 'ring.csv', SHA-256 " in result.mission.text
     assert "control_points" in result.mission.text
+
+
+def _circles(rate: float, time: float) -> list:
+    """Rows of three vehicles that go on round the origin as a rigid body, from where an orbit has led them."""
+    t = np.linspace(0.0, time, 41)
+    slots = np.array([[3.0, 0.0, 0.0], [-1.5, 2.6, 0.0], [-1.5, -2.6, 0.0]])
+    begin = 8.0 + (slots[:, 0] + 1j * slots[:, 1])
+    rows = []
+    for z in begin * np.exp(1j * rate * 4.5):  # 3 s of run-in turn half as far as 3 s after it
+        y = [(1j * rate) ** k * z * np.exp(1j * rate * t) for k in range(4)]
+        states = [
+            np.stack([w.real, w.imag, 10.0 * (k == 0) + 0.0 * t, 0.0 * t], axis=1)
+            for k, w in enumerate(y)
+        ]
+        rows.append(curve_to_rows(Piecewise.hermite(t, np.stack(states))))
+    return rows
+
+
+@pytest.mark.parametrize("rate", [20.0, 60.0])
+def test_vehicles_fly_their_files_from_a_body_that_turns(rate):
+    """Files that go on as the vehicles move are flown as they are, whether or not the body turned before."""
+    mission = rf.Mission.from_dict({
+        "schema_version": 1, "name": "on", "smoothness": "jerk", "output_step": 0.05,
+        "formations": {"three": {"edges": "complete", "slots": [[3, 0, 0], [-1.5, 2.6, 0], [-1.5, -2.6, 0]]}},
+        "agents": {"position": [[11.0, 0, 10], [6.5, 2.6, 10], [6.5, -2.6, 10]], "mass": 1.0},
+        "phases": [
+            {"kind": "establish", "formation": "three", "blend": 2.0, "duration": 3.0},
+            {"kind": "orbit", "centre": [0, 0, 10], "radius": 8.0, "rate_deg_s": rate, "blend": 3.0, "duration": 6.0,
+             "yaw": "along"},
+            {"kind": "follow", "trajectories": _circles(np.radians(rate), 3.0), "duration": 3.0},
+        ],
+    })  # fmt: skip
+    result = rf.simulate(mission)
+    inside = result.phase == 2
+    radius = np.hypot(*result.position[inside][..., :2].T)
+    assert np.ptp(radius, axis=1).max() < 1e-6
+    moved = np.diff(np.unwrap(np.arctan2(*result.position[inside][..., [1, 0]].T)), axis=1)
+    expected = np.broadcast_to(np.radians(rate) * np.diff(result.time[inside]), moved.shape)
+    np.testing.assert_allclose(moved, expected, atol=1e-6)
+
+
+def test_files_that_end_in_motion_are_followed_by_files_alone():
+    """Where vehicles move beside each other at the end, what follows goes on with that motion or is refused."""
+    row = lambda x: [2.0, *x, 0.0, 0.0, 0.0, 10.0, 0.0, 0.0, 0.0, 0.0, 0.0]  # noqa: E731
+    first = [[row([0.0, 0.0, 0.0])], [row([5.0, 0.0, 0.25])]]
+    second = [[row([0.0, 0.0, 0.0])], [row([6.0, 1.0, -0.25])]]
+    data = {
+        "schema_version": 1, "name": "two", "output_step": 0.05,
+        "agents": {"position": [[0.0, 0, 10], [5.0, 0, 10]], "mass": 1.0},
+        "limits": {"tracking_error": 0.02},
+    }  # fmt: skip
+    phases = [{"kind": "follow", "trajectories": x, "duration": 2.0} for x in (first, second)]
+    hold = {"kind": "hold", "duration": 1.0}
+    assert rf.assess(rf.simulate(rf.Mission.from_dict(data | {"phases": [*phases, hold]}))).passed
+    cut = phases[0] | {"duration": 1.0, "travel": 2.0}
+    for before, speed in (phases[0], "0.50"), (cut, "0.25"):
+        with pytest.raises(rf.MissionError, match=f"goes on at {speed} m/s beside the others"):
+            rf.simulate(rf.Mission.from_dict(data | {"phases": [before, hold]}))

@@ -1313,6 +1313,10 @@ def test_command(folder, capsys):
     assert capsys.readouterr() == ("", "")
     assert Path("sweeps/pair/sweep.db").read_bytes() == before
     assert "Median: thrust" in Path("sweeps/pair/figures/map.svg").read_text()
+    for wrong in ["--map", "agents.mass.1", "agents.mass.9"], ["--metric", "weight"]:
+        assert cli.main([*line, "--out", "before", "--runs", "4", *wrong]) == codes.BAD_INPUT
+        assert f"'{wrong[-1]}' cannot be drawn" in " ".join(capsys.readouterr().err.split())
+        assert not Path("before").exists()  # told before a run
     assert cli.main(["sweep", "pair.toml", "--summary"]) == codes.BAD_INPUT
     assert "contains no sweep" in capsys.readouterr().err
     assert cli.main(["sweep", "sweeps/pair", "--seed", "3"]) == codes.BAD_INPUT

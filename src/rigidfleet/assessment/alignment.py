@@ -28,6 +28,9 @@ _TURNS, _STEP, _FEW, _MANY = 12, 0.25, 150, 2000
 #: looks like a little of each.
 _MOVES, _UNTOLD = (0.02, 0.05, 0.05), np.array([0.1, 0.1, 0.1, np.inf, np.inf, np.inf])
 _FLOOR = np.array([1e-3, 5e-4, 2e-4, 1e-3, 1e-3, 1e-3])
+#: Least scale of a set-up, and greatest step of each parameter in one turn.
+_SMALLEST = 1e-3
+_FARTHEST = np.array([0.5, np.pi, 1.0, np.inf, np.inf, np.inf])
 #: Errors from which on a vehicle's offset differs from that of others, and the least that does [s].
 _SURE, _LATE = 4.0, 0.01
 
@@ -78,7 +81,7 @@ def align(logs: Logs, plan: Plan, clock: str) -> Alignment:
         logs = [(t - by, x) for (t, x), by in zip(logs, apart, strict=True)]
     start[0] = _nearest_offset(logs, plan) if clock == "offset" else 0.0
     every = np.ones(6, dtype=np.bool_)
-    whole, errors, left = _fit(logs, plan, start, every)
+    whole, errors, left = _fit(logs, plan, start, every, _setup_at(logs, plan, start[0])[1])
     own = np.empty((2, len(logs)))
     for i, (log, way) in enumerate(zip(logs, plan, strict=True)):
         alone, error, _ = _fit([log], [way], whole, every)
@@ -107,9 +110,14 @@ def _residuals(logs: Logs, plan: Plan, q: Floats) -> tuple[Floats, Floats, Float
     return np.concatenate(off), np.concatenate(slopes), np.concatenate(times)
 
 
-def _fit(logs: Logs, plan: Plan, start: Floats, free: Bools) -> tuple[Floats, Floats, float]:
-    """The ``free`` parameters (6,) that a flight tells, from a start; their errors; the distance that is left."""
-    q, free, errors = start.copy(), free.copy(), np.full(6, np.nan)
+def _fit(
+    logs: Logs, plan: Plan, start: Floats, free: Bools, guess: Floats | None = None
+) -> tuple[Floats, Floats, float]:
+    """The ``free`` parameters (6,) that a flight tells, from a guess; their errors; the distance that is left.
+
+    The others are those of the start.
+    """
+    q, free, errors = (start if guess is None else guess).copy(), free.copy(), np.full(6, np.nan)
     for _ in range(_TURNS):
         off, slope, time = _residuals(logs, plan, q)
         if not (len(off) and free.any()):
@@ -122,7 +130,7 @@ def _fit(logs: Logs, plan: Plan, start: Floats, free: Bools) -> tuple[Floats, Fl
                 free[j], q[j] = False, start[j]
         A = slope[..., free]
         step = np.linalg.lstsq(A.reshape(3 * len(off), -1), off.ravel(), rcond=None)[0]
-        step[: int(free[0])] = np.clip(step[: int(free[0])], -0.5, 0.5)
+        step = np.clip(step, -_FARTHEST[free], _FARTHEST[free])
         q[free] += step
         errors[:] = np.nan
         errors[free] = np.hypot(_standard_errors(A, off - A @ step, time), _FLOOR[free])
@@ -159,9 +167,22 @@ def _nearest_offset(logs: Logs, plan: Plan) -> float:
     least = 0.5 * min(end - begin, span[1] - span[0])
     best = np.inf, 0.0
     for offset in np.arange(begin - span[1] + least, end - span[0] - least + _STEP, _STEP).tolist():
-        off, slope, _ = _residuals(few, plan, np.array([offset, *np.zeros(5)]))
-        A, b = slope[..., 1:].reshape(-1, 5), off.ravel()
-        if len(off) > 5:
-            left = b - A @ np.linalg.lstsq(A, b, rcond=None)[0]
-            best = min(best, (float((left**2).mean()), offset))
+        best = min(best, (_setup_at(few, plan, offset)[0], offset))
     return best[1]
+
+
+def _setup_at(logs: Logs, plan: Plan, offset: float) -> tuple[float, Floats]:
+    """The set-up that agrees best at an offset: the mean square that is left [m^2], infinite if too little is, and all.
+
+    A turn of any angle with a scale is linear in what it makes of x and y; heights have a scale of their own here.
+    """
+    q = np.array([offset, *np.zeros(5)])
+    off, slope, _ = _residuals(logs, plan, q)
+    if len(off) <= 5:
+        return np.inf, q
+    level = slope[..., 2:3] * np.array([[1.0], [1.0], [0.0]])
+    A, b = np.concatenate([slope[..., 1:], level], axis=2).reshape(-1, 6), off.ravel()
+    turned, scaled, *q[3:], more = x = np.linalg.lstsq(A, b, rcond=None)[0]
+    z = complex(1.0 + scaled + more, turned)
+    q[1:3] = np.angle(z), np.log(max(abs(z), _SMALLEST))
+    return float(((b - A @ x) ** 2).mean()), q

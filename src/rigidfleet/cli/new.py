@@ -14,7 +14,7 @@ from rigidfleet.cli import console
 from rigidfleet.cli.arguments import parse_number, parse_whole, to_whole_number
 from rigidfleet.cli.check import plain_facts
 from rigidfleet.cli.codes import PASSED
-from rigidfleet.cli.outputs import refuse_overwriting
+from rigidfleet.cli.outputs import mission_file, refuse_overwriting
 from rigidfleet.errors import RigidfleetError
 
 
@@ -88,7 +88,7 @@ def new(
     file = Path(name or "mission")
     if not file.name:
         raise RigidfleetError(f"{file}: is a folder. Name a file.")
-    file = file if file.suffix == ".toml" else file.with_name(f"{file.name}.toml")
+    file = mission_file(file)
     refuse_overwriting(file, force=force, other="give another name")
     if not show and (formations or shape or "cube") not in SHAPES:  # points make a show
         show, formations = True, formations or options.pop("shape")

@@ -137,6 +137,11 @@ class Files:
             console.out().print(text, soft_wrap=True)
 
 
+def mission_file(path: Path) -> Path:
+    """The path of a mission: with .toml, as reading expects it."""
+    return path if path.suffix == ".toml" else path.with_name(f"{path.name}.toml")
+
+
 def refuse_overwriting(
     *paths: Path | None, force: bool, other: str = "--out to choose another place"
 ) -> None:

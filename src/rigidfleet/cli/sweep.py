@@ -133,6 +133,10 @@ def sweep(
         limits = {"separation": separation, "radius": radius}
         definition, whole = _sweep_and_folder(mission, vary or [], runs, out, shard, keys, limits)
         folder = shards.shard_folder(whole, shard)
+        if (map_ or metric) and definition.drill:
+            raise RigidfleetError("--map and --metric: a drill has no map. Remove them.")
+        numbers = [column.name for column in definition.columns if column.in_order]
+        figures.check_map(numbers, map_ or (), metric or "success")
         try:
             with show_progress(None if quiet else console.SweepWatch()) as progress:
                 table = fly(

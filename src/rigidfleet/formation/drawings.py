@@ -18,9 +18,7 @@ _SPACE, _LINK = "{http://www.w3.org/2000/svg}", "{http://www.w3.org/1999/xlink}h
 #: Elements that are drawn, or hold such; all others are drawn where something refers to them, if at all.
 _DRAWN = r"svg|g|a|switch|use|path|rect|circle|ellipse|line|polyline|polygon|text|tspan|image"
 #: Properties that change what is seen of a shape, and are not followed.
-_IGNORED = (
-    r"\b(clip-path|mask|filter|marker[-a-z]*|transform-(?:origin|box))\s*[:=]\s*[\"']?\s*(?!none)\w"
-)
+_IGNORED = r"\b(clip-path|mask|filter|marker[-a-z]*|transform-(?:origin|box)|ref[XY])\s*[:=]\s*[\"']?\s*(?!none)[-\w.]"
 #: An own style without opacity.
 _UNSEEN = r"(?<![-\w])opacity\s*:\s*[0.]+%?\s*(;|!|$)"
 #: Lengths, and of which side of the view around (2: its diagonal) they may be shares.

@@ -76,9 +76,10 @@ def _abort(m: Draft) -> Breaches:
     if options is None or options.at is None or m.end is None or m.findings:
         return
     begins = options.at + options.reaction
-    if begins >= m.end:
-        problem = f"and the reaction of {options.reaction:g} s are not before the end of the mission at {m.end:g} s"
-        yield Breach(("abort", "at"), problem, "give an earlier time or remove it")
+    if not 0.0 < begins < m.end:  # nothing has been flown at the start
+        within = f"after the start and before the end of the mission at {m.end:g} s"
+        problem = f"and the reaction of {options.reaction:g} s are not {within}"
+        yield Breach(("abort", "at"), problem, "give another time or remove it")
     yield from _slots_tracked(m, begins, "abort", "slow down", "abort at another time")
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.kernel.problem import NO_KNOTS, NO_WAYS, Motion
 from rigidfleet.math import attitude as att
+from rigidfleet.math import series
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Fly, Mission, Phase
 from rigidfleet.mission.kinds import (
@@ -195,6 +196,12 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
         start[0] = slots
         if now.rates is not None:
             start[1:] = now.rates
+        if begin[1:, 3:].any():
+            # The slots take over the turn of the body: files that go on so are flown as they are.
+            turn = series.from_derivatives(np.stack([pose.omega, pose.alpha, pose.alpha_dot]))
+            turn = series.from_rates(np.eye(3), turn).swapaxes(1, 2)
+            start = series.product(series.from_derivatives(start), turn, np.matmul)
+            start, begin[1:, 3:] = series.derivatives(start), 0.0
         own = Piecewise(knots, ways).start_from(start, fade)
         end = own.at(own.time[-1:])[0]
         lift = Lift(end - slots, length, now.t + own.time, np.ascontiguousarray(own.pieces))
@@ -207,6 +214,10 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
 
 def course_conflict(phase: Any, now: PhaseState) -> str:
     """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
+    if now.rates is not None and not phase.follows_curves:
+        speed = np.linalg.norm(now.rates[0], axis=1)
+        if (most := float(speed.max())) > _START_TOLERANCES[1]:
+            return f"begins while agent {speed.argmax() + 1} goes on at {most:.2f} m/s beside the others"
     if phase.bent:
         first = np.array(phase.control_points)[0]
         if now.slots is None or not np.abs(first - now.slots).max() < _START_TOLERANCES[0]:

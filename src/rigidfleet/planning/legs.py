@@ -15,6 +15,7 @@ import numpy as np
 
 from rigidfleet.kernel.problem import CONSTANT, SHAPE, SQUARED, Motion, Reference
 from rigidfleet.math import rigid_body
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
 from rigidfleet.mission import Mission, Phase, Settle
 from rigidfleet.mission.kinds import seconds
@@ -36,6 +37,8 @@ _KINDS = {"shape": SHAPE, "squares": SQUARED, "step": CONSTANT}
 _NONE = np.zeros(0)
 #: Shortest phase [s], of one that is to end before it begins.
 _SHORTEST = 1e-6
+#: Speed of a slot about the CM above which it does not rest [m/s].
+_MOVES = 1e-6
 #: Number of times at which a phase that ends by settling is looked at.
 _LOOKS = 201
 
@@ -180,12 +183,16 @@ class Leg:
         self, t: float, r: Floats, v: Floats, frame: Floats | None, pose: Pose | None
     ) -> PhaseState:
         """The state from which the next phase starts if this one ends at t [s], with the agents at r and v (N, 3)."""
-        goal, blend = self.goal, self.reference
+        goal, blend, slots, rates = self.goal, self.reference, self.slots, None
         if self.phase.goal_moves and pose is not None and goal is not None and t < self.t_end:
             goal = copy_with(pose, T=pose.T if self.phase.turns_away else goal.T, named=goal.named)
+        if self.phase.follows_curves and len(blend.knots):  # which may end in motion
+            own = Piecewise(blend.knots, blend.ways).states(np.minimum([t], blend.knots[-1]), 4)
+            if np.abs(own[1]).max() > _MOVES:
+                slots, rates = own[0, 0], own[1:, 0]
         return copy_with(
-            self.before, t=t, r=r, v=v, frame=frame, formation=self.formation, slots=self.slots, pose=pose, goal=goal,
-            rates=None, blend=blend if t < blend.t0 + blend.T_b else None,
+            self.before, t=t, r=r, v=v, frame=frame, formation=self.formation, slots=slots, pose=pose, goal=goal,
+            rates=rates, blend=blend if t < blend.t0 + blend.T_b else None,
         )  # fmt: skip
 
 

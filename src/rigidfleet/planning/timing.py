@@ -114,8 +114,12 @@ def timed_leg(mission: Mission, phase: Phase, now: PhaseState, number: int) -> L
     """
     departure = depart(mission, phase, now)
     if problem := course_conflict(phase, departure.now):
-        key = "file" if phase.follows_curves else "formation"
+        key = "file" if phase.follows_curves else "formation" if phase.bent else "kind"
         remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
+        if key == "kind":
+            remedy = (
+                "let the trajectories before end at rest, or let another 'follow' go on with them"
+            )
         raise ways.error_of_key(mission, number, key, None, problem, remedy)
     if not phase.automatic:
         return leg_from(mission, phase, departure)

@@ -203,7 +203,7 @@ def _offsets(alignment: Alignment, clock: Clock) -> Floats:
         return np.zeros((2, 1))
     offsets = np.where(np.isnan(alignment.own), every, alignment.own) if clock == "own" else every
     if np.isnan(offsets).any():
-        why = "the clock cannot be told: the plan hardly moves"
+        why = "the clock cannot be told: the plan hardly moves, or the log is not of it"
         raise TrajectoryError(f"{why}. Give logs of one clock, with --clock recorded.")
     return offsets
 

@@ -103,6 +103,16 @@ class SweepColumn:
         """Path of the number, counted from 1."""
         return keypaths.name_of(self.keys)
 
+    @property
+    def in_words(self) -> bool:
+        """Whether some of its values are no numbers."""
+        return not all(map(is_number, getattr(self.variation, "values", ())))
+
+    @property
+    def in_order(self) -> bool:
+        """Whether its values have an order; those of seeds have none."""
+        return not self.in_words and self.keys[-1] != "seed"
+
 
 class Sweep:
     """A checked sweep. Create one by `Sweep.of`, or from a file by `Sweep.load`.

@@ -203,7 +203,8 @@ class Show:
         from rigidfleet.simulation.trajectories import judging_mission
 
         self.mission, self.drill, self.n = mission, drill, mission.n_agents
-        self.curve, self.how, verdict = self._ways(mission, drill.files)
+        self.names: tuple[str, ...] = ()
+        self.curve, self.how, verdict, self.names = self._ways(mission, drill.files)
         if not verdict.passed:
             why = next(check.message for check in verdict.checks if not check.passed)
             raise RigidfleetError(
@@ -229,8 +230,13 @@ class Show:
             for name in drill.stale
         ]
 
-    def _ways(self, mission: Mission, files: Sequence[str]) -> tuple[Piecewise, str, Verdict]:
-        """Ways of a mission's vehicles, or of those in files; what they are, in words; and the verdict."""
+    def _ways(
+        self, mission: Mission, files: Sequence[str]
+    ) -> tuple[Piecewise, str, Verdict, tuple[str, ...]]:
+        """Ways of a mission's vehicles, or of those in files; what they are, in words; the verdict; names in files.
+
+        Vehicles of an earlier version are in the order of the show, if they have its names.
+        """
         from rigidfleet.assessment import assess
         from rigidfleet.foreign.files import read_trajectories
         from rigidfleet.setpoints import ways_of
@@ -243,7 +249,11 @@ class Show:
                 raise RigidfleetError(
                     f"{files[0]}: has {len(read.curves)} vehicles, and the show {self.n}. Give a file of each."
                 )
-            return join(read.curves), read.assumed, assess(of_curves(read, mission=mission))
+            if {*read.names} == {*self.names}:
+                order = [read.names.index(name) for name in self.names]
+                read = read._replace(names=self.names, curves=tuple(read.curves[i] for i in order))
+            verdict = assess(of_curves(read, mission=mission))
+            return join(read.curves), read.assumed, verdict, read.names
         if mission.n_agents != self.n:
             raise RigidfleetError(
                 f"drill.stale: {mission.name} has {mission.n_agents} agents, and the show {self.n}. Give an earlier"
@@ -253,7 +263,7 @@ class Show:
         motion = result.motion(flown=False)
         if not np.isfinite(motion.state).all():  # where no slots are tracked, vehicles have no file
             motion = result.motion(flown=True)
-        return ways_of(motion, slice(None)), NAMES[7], assess(result)
+        return ways_of(motion, slice(None)), NAMES[7], assess(result), ()
 
     def outcome(self, fault: GeometricFault) -> tuple[dict[str, float | None], str, str]:
         """What was measured of a fault, the checks that it fails, and the first of these in words."""
@@ -266,9 +276,11 @@ class Show:
         verdict = assess(result)
         failed = [check for check in verdict.checks if not check.passed]
         worst = {c.check: c.worst for c in verdict.checks if c.judged and c.check in METRICS}
+        named = {k: x for k, x in enumerate(self.names) if x.removeprefix("agent ") != f"{k + 1}"}
+        who = [f"{k + 1} ({named[k]})" if k in named else f"{k + 1}" for k in every.tolist()]
 
         def in_fleet(match: re.Match[str]) -> str:
-            return re.sub(r"\d+", lambda number: str(every[int(number[0]) - 1] + 1), match[0])
+            return re.sub(r"\d+", lambda number: who[int(number[0]) - 1], match[0])
 
         words = _AGENTS.sub(in_fleet, failed[0].message) if failed else ""
         return worst, ", ".join(dict.fromkeys(check.check for check in failed)), words

@@ -309,6 +309,25 @@ def correlations(table: Table) -> Figure | None:
     return fig
 
 
+def check_map(numbers: list[str], over: Sequence[str], metric: str) -> None:
+    """Check that a map can be drawn over two of the numbers that vary, or over those with the strongest correlation.
+
+    Raises
+    ------
+    RigidfleetError
+        The sweep has no such path or metric.
+    """
+    known = ["success", *METRICS]
+    unknown = [(p, numbers) for p in over if p not in numbers]
+    unknown += [(metric, known)] if metric not in known else []
+    if unknown or len(over) not in (0, 2):
+        word, words = unknown[0] if unknown else (" ".join(over), numbers)
+        why = " (a seed has no order)" if word.endswith("seed") else ""
+        raise RigidfleetError(
+            f"map: '{word}' cannot be drawn{why}. Choose from: {', '.join(words)}."
+        )
+
+
 def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure | None:
     """Map of the success rate, or of the median of a metric, over two varied numbers.
 
@@ -327,15 +346,7 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
         over = list(dict.fromkeys([*ranked, *numbers]))[:2]
         if len(over) < 2:
             return None
-    known = ["success", *METRICS]
-    unknown = [(p, list(numbers)) for p in over if p not in numbers]
-    unknown += [(metric, known)] if metric not in known else []
-    if unknown or len(over) != 2:
-        word, words = unknown[0] if unknown else (" ".join(over), list(numbers))
-        why = " (a seed has no order)" if word.endswith("seed") else ""
-        raise RigidfleetError(
-            f"map: '{word}' cannot be drawn{why}. Choose from: {', '.join(words)}."
-        )
+    check_map(list(numbers), over, metric)
     values = 100.0 * table.passed if metric == "success" else table.metrics[metric]
     (x, at_x), (y, at_y) = (_cells(numbers[p], _spacing(table, p)) for p in over)
     cells = np.full((len(y) - 1, len(x) - 1), np.nan)

@@ -20,7 +20,6 @@ from rigidfleet.sweep import store
 from rigidfleet.sweep.faults import UNITS
 from rigidfleet.sweep.metrics import METRICS, readable_unit
 from rigidfleet.sweep.record import reason_in_words
-from rigidfleet.sweep.variation import is_number
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Percentiles of metrics.
@@ -237,9 +236,9 @@ def summarise(table: store.Table) -> Summary:
     for name, values in table.metrics.items():
         if len(finite := values[np.isfinite(values)]):
             percentiles[name] = np.percentile(finite, PERCENTILES).tolist()
-    by_value, worded = {}, _columns_in_words(table)
+    by_value = {}
     for k, column in enumerate(table.sweep.columns):
-        if column.name in worded:
+        if column.in_words:
             words = np.array([str(column.variation.decode(x)) for x in table.codes[:, k].tolist()])
             by_value[column.name] = {
                 word: rate(table.passed[words == word]) for word in dict.fromkeys(words.tolist())
@@ -330,11 +329,10 @@ def outcomes(table: store.Table) -> dict[str, Floats]:
 
 def varied_numbers(table: store.Table) -> dict[str, Floats]:
     """Varied numbers by path, without seeds, which have no order, and variations that are not numeric."""
-    worded = _columns_in_words(table)
     return {
         column.name: table.codes[:, k]
         for k, column in enumerate(table.sweep.columns)
-        if column.name not in worded and column.keys[-1] != "seed" and _differs(table.codes[:, k])
+        if column.in_order and _differs(table.codes[:, k])
     }
 
 
@@ -388,14 +386,6 @@ def _rank_correlation(x: Floats, y: Floats) -> tuple[float, float]:
         return r, least
     t = abs(r) * math.sqrt(free / ((1.0 + r) * (1.0 - r)))
     return r, max(float(2.0 * stdtr(free, -t)), least)
-
-
-def _columns_in_words(table: store.Table) -> set[str]:
-    return {
-        column.name
-        for column in table.sweep.columns
-        if not all(map(is_number, getattr(column.variation, "values", ())))
-    }
 
 
 def _differs(values: Floats, relative: float = 0.0, absolute: float = 0.0) -> bool:
