@@ -53,7 +53,7 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
         if not any(going):
             return [flight.finish() for flight in flights]
         active = [flight.under_way() for flight, goes in zip(flights, going, strict=True) if goes]
-        points = [phase for phase in active if isinstance(phase, PointPhase)]
+        points = [x for x in active if isinstance(x, PointPhase)]
         if all(going) and len(points) == len(active) and _can_share_steps(active):
             if vector is None:
                 from rigidfleet.kernel.engine import batch
