@@ -58,7 +58,11 @@ class MachineCode(BuildHookInterface):
         # Each of these processes takes up to 600 MB.
         with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
             made = dict(
-                zip(jobs, pool.map(lambda job: objects.objects_of(*job[::-1]), jobs), strict=True)
+                zip(
+                    jobs,
+                    pool.map(lambda job: objects.compile_objects(*job[::-1]), jobs),
+                    strict=True,
+                )
             )
         include = {}
         try:

@@ -24,7 +24,7 @@ from rigidfleet.math import proximity
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Mission
 from rigidfleet.planning import transfers
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.simulation.flight import simulate
 from rigidfleet.typing import Floats
@@ -164,7 +164,7 @@ def permutation(n: int, seed: int) -> list[str]:
             ],
         }
     )
-    planned, took = clocked(lambda: preview(complete_times(mission))[0][1:])
+    planned, took = clocked(lambda: preview_phases(complete_times(mission))[0][1:])
     least = min(p.certificate.separation for p in planned if p.certificate is not None)
     assert all(p.certificate is not None for p in planned)
     makespan = float(planned[-1].time[-1] - planned[0].time[0])
@@ -198,7 +198,7 @@ def published(some: int | None) -> Iterator[tuple[str, float, float, float]]:
 
 def solved(name, start, goal, distance, speed, acceleration, box, downwash):
     found, took = clocked(
-        lambda: transfers.transfer(
+        lambda: transfers.plan_transfer(
             start,
             goal,
             distance=distance,

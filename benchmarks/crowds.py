@@ -27,7 +27,7 @@ from rigidfleet.kernel.problem import graph, workspace
 from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
-from rigidfleet.planning.transfers import least_duration, transfer
+from rigidfleet.planning.transfers import least_duration, plan_transfer
 from rigidfleet.typing import Floats
 
 #: Greatest acceleration and speed, what centres are to keep, period of the commands.
@@ -82,7 +82,9 @@ def kernel(n: int, **given: Any) -> tuple[Any, ...]:
     )
     mass = np.ones(n)
     problem = plan.problem._replace(graph=graph(np.zeros((0, 2), dtype=np.int64), mass))
-    vehicles = fleet.quadrotors([fleet.VehicleDynamics(1.0, point=True, limit=THRUST)] * n, 0.0)
+    vehicles = fleet.quadrotor_arrays(
+        [fleet.VehicleDynamics(1.0, point=True, limit=THRUST)] * n, 0.0
+    )
     flight = fleet.ideal_flight(vehicles, start=0.0, h=PERIOD, steps=1)
     work = workspace(n, 0)
     state = fleet.initial_state(flight, np.zeros((n, fleet.STATES)), work)
@@ -112,7 +114,7 @@ def asked(r: Floats, v: Floats, goal: Floats) -> Floats:
     return limited(3.0 * (preferred(r, goal) - v))
 
 
-def least_distance(r: Floats, v: Floats, a: Floats, pairs: tuple[Any, Any]) -> float:
+def least_norm_solution(r: Floats, v: Floats, a: Floats, pairs: tuple[Any, Any]) -> float:
     """Least distance [m] of any two over a period with constant accelerations."""
     i, j = pairs
     x = r[i] - r[j]
@@ -158,7 +160,7 @@ def fly(r: Floats, law: Law, longest: float, *, at_once: bool = False) -> Flown:
         cost += took
         if at_once:
             v, c = v + c * PERIOD, 0.0 * c
-        least = min(least, least_distance(r, v, c, pairs))
+        least = min(least, least_norm_solution(r, v, c, pairs))
         r, v = r + v * PERIOD + 0.5 * c * PERIOD**2, v + c * PERIOD
         there = np.linalg.norm(r - goal, axis=1) < 0.1
         arrived = np.where(there, np.minimum(arrived, (k + 1) * PERIOD), np.inf)
@@ -205,7 +207,7 @@ def planned(n: int, radius: float, *, ring: bool, seed: int) -> tuple[float, flo
     box = np.full(3, radius + 3.0)
     speed, acceleration = SPEED / 3**0.5, THRUST / 3**0.5
     begun = time.process_time()
-    found = transfer(
+    found = plan_transfer(
         s, -s, distance=APART, speed=speed, acceleration=acceleration, box=(-box, box), seed=seed
     )
     took = time.process_time() - begun

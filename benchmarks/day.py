@@ -164,7 +164,7 @@ def pages(folder: Path) -> Iterator[Line]:
         str(folder / name) for name in ("sixty.toml", "sixty", "home", "sixty-drill")
     )
     Path(file).write_text(
-        show_draft.show_text("sixty", scenes, agents=60, spacing=2.0), encoding="utf-8"
+        show_draft.show_mission_text("sixty", scenes, agents=60, spacing=2.0), encoding="utf-8"
     )
     ran("run", file, "--no-figures", "--quiet", "--out", out)
     ran("check", file, "--abort", "--out", home)

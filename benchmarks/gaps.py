@@ -20,7 +20,7 @@ from scipy.ndimage import binary_propagation
 
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.typing import Floats
 
@@ -125,7 +125,7 @@ def clear(axes: list[Floats], offset: Floats, boxes: Sequence[dict[str, Any]]) -
 def kept(flown: Mission, boxes: Sequence[dict[str, Any]]) -> float:
     """Least clearance [m] of the planned paths: dense samples, beside the proof."""
     least = np.inf
-    for planned in preview(flown)[0]:
+    for planned in preview_phases(flown)[0]:
         for box in boxes:
             r = planned.position
             out = np.maximum(np.maximum(np.array(box["min"]) - r, r - box["max"]), 0.0)

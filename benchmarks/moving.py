@@ -25,10 +25,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from crowds import PERIOD, THRUST, kernel, on_parabolas
 
-from rigidfleet.kernel.avoidance import candidates, initial_sight
+from rigidfleet.kernel.avoidance import candidate_accelerations, initial_sight
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.packing import Packed, pack
-from rigidfleet.solids.records import Solids, ball, join, one_solid
+from rigidfleet.solids.records import Solids, ball, join_solids, one_solid
 from rigidfleet.typing import Floats
 
 #: Speeds of vehicles, and greatest speeds of obstacles [m/s].
@@ -101,7 +101,11 @@ def escapes(given: Scene) -> tuple[Any, Floats]:
     known = np.sort([t[np.argmax(each <= RANGE)] for each in away if (each <= RANGE).any()])
     known += SETTLE
     t = t[t <= max(known, default=0.0) + AHEAD]
-    push = np.concatenate([candidates()[-1:], candidates()[:26]]) * SHARE * THRUST
+    push = (
+        np.concatenate([candidate_accelerations()[-1:], candidate_accelerations()[:26]])
+        * SHARE
+        * THRUST
+    )
     shift = np.zeros((1, len(t), 3))
     for begin, held in zip(known, [*np.minimum(np.diff(known), HELD), HELD], strict=False):
         own = push[:, None] * bend(t - begin, held)[:, None]
@@ -144,7 +148,7 @@ def asked(r: Floats, v: Floats, slots: Floats, speed: float, t: float) -> Floats
 def solids(given: Scene) -> Solids:
     """The obstacles of a scene, for a minute."""
     ends = np.array([0.0, 60.0])
-    return join(
+    return join_solids(
         [
             one_solid(ball(place, BALL), ends, np.outer(ends, w))
             for place, w in zip(given.place, given.velocity, strict=True)

@@ -283,12 +283,12 @@ def joined(slots: Floats, d: int, rng: np.random.Generator) -> Ints:
     for j in range(1, len(slots)):
         before = list(combinations(range(j), min(d, j)))
         picks = [before[k] for k in rng.permutation(len(before))[:30]]
-        best = max(picks, key=lambda who: _spread(slots[list(who)] - slots[j], d))
+        best = max(picks, key=lambda who: _repeat_for_agents(slots[list(who)] - slots[j], d))
         edges += [(i, j) for i in best]
     return np.array(sorted(edges), dtype=np.int64)
 
 
-def _spread(u: Floats, d: int) -> float:
+def _repeat_for_agents(u: Floats, d: int) -> float:
     """Smallest singular value of the directions u (k, 3), those to one agent from its neighbours."""
     s = np.linalg.svd(u / np.linalg.norm(u, axis=1)[:, None], compute_uv=False)
     return float(s[min(len(u), d) - 1])
@@ -499,7 +499,7 @@ def cells(s: dict[str, Any]) -> list[str]:
     return [
         s["row"],
         str(s["flights"]),
-        _share(s["intended"], s["flights"]),
+        _fly_in_threads(s["intended"], s["flights"]),
         *(part(s[w]) for w in _WHERE.values()),
         *(str(s[end]) for end in _ELSEWHERE),
         str(sum(s[end] for end in _FAILED)),
@@ -517,7 +517,7 @@ def crossings(outcomes: Sequence[Outcome]) -> list[list[str]]:
         for name, times in (("0", [0]), ("1 or 2", [1, 2]), ("3 or more", range(3, 200))):
             there = [o for o in mine if o.crossings in times]
             right = sum(o.end == "intended" for o in there)
-            lines.append([row, name, str(len(there)), _share(right, len(there))])
+            lines.append([row, name, str(len(there)), _fly_in_threads(right, len(there))])
     return lines
 
 
@@ -531,7 +531,9 @@ def sides(outcomes: Sequence[Outcome]) -> list[list[str]]:
             ]
             right = sum(o.end == "intended" for o in there)
             hand = sum(o.end == "mirrored" for o in there)
-            lines.append([row, name, str(len(there)), _share(right, len(there)), str(hand)])
+            lines.append(
+                [row, name, str(len(there)), _fly_in_threads(right, len(there)), str(hand)]
+            )
     return lines
 
 
@@ -566,7 +568,7 @@ def damping_lines(outcomes: dict[str, list[Outcome]]) -> list[list[str]]:
     return lines
 
 
-def _share(part: int, whole: int) -> str:
+def _fly_in_threads(part: int, whole: int) -> str:
     return f"{100 * part / whole:.1f} %" if whole else ""
 
 

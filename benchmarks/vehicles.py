@@ -70,7 +70,7 @@ def hover(n: int, h: float) -> float:
     """Vehicle-steps per second of n vehicles that hover, of 4 s of flight."""
     problem, work, flight, state = begun([VEHICLE] * n, h=h, steps=round(1.0 / (RATE * h)))
     start = time.process_time()
-    sampled.fly_ticks(problem, work, flight, state, fleet.segment(n, 0, 4.0))
+    sampled.fly_ticks(problem, work, flight, state, fleet.sampled_segment(n, 0, 4.0))
     return n * int(state.count[fleet.STEPS]) / (time.process_time() - start)
 
 
@@ -79,7 +79,7 @@ def passage(h: float) -> tuple[float, float, np.ndarray]:
     mission = load_mission("cube-passage")
     agents, state, spent, path = mission.agents, None, 0.0, []
     now = PhaseState(0.0, np.array(agents.position), np.array(agents.velocity))
-    vehicles = fleet.quadrotors([VEHICLE] * len(now.r), G)
+    vehicles = fleet.quadrotor_arrays([VEHICLE] * len(now.r), G)
     flight = fleet.ideal_flight(vehicles, start=0.0, h=h, steps=round(1.0 / (RATE * h)))
     S = fleet.hover_states(vehicles, now.r, now.v)
     for phase in mission.phases:
@@ -91,7 +91,7 @@ def passage(h: float) -> tuple[float, float, np.ndarray]:
             state = fleet.initial_state(flight, S, work)
         state = fleet.state_under_problem(state, work, integral)
         times = plan.start + 0.1 * np.arange(1, round(10.0 * (plan.t_end - plan.start)) + 1)
-        call = fleet.segment(len(S), m, plan.t_end, times)
+        call = fleet.sampled_segment(len(S), m, plan.t_end, times)
         begun_at = time.process_time()
         status = sampled.fly_ticks(plan.problem, work, flight, state, call)
         spent += time.process_time() - begun_at

@@ -23,7 +23,7 @@ from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.abort import Aborts
 from rigidfleet.planning.legs import state_at_start
 from rigidfleet.planning.losses import legs_from
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.plotting.style import DASHES, FAINT, FLOWN, GREY, INK, PALETTE, TONES
 
@@ -431,7 +431,7 @@ def error_budget() -> Figure:
 def way_found() -> Figure:
     """The passage of narrow-passage-found from above, as it is found: formations at the ends of its phases."""
     mission = complete_times(load_mission("narrow-passage-found"))
-    planned = [p for p in preview(mission)[0] if p.phase.startswith("through the passage")]
+    planned = [p for p in preview_phases(mission)[0] if p.phase.startswith("through the passage")]
     fig = Figure(figsize=(7.6, 3.6), layout="constrained")
     ax = fig.add_subplot()
     for thing in mission.obstacles:
@@ -494,7 +494,7 @@ def way_home() -> Figure:
             ax.plot(r[..., 0], r[..., 2], color=colour, linewidth=width)
         ax.plot(*abort.steps[0].end[:, [0, 2]].T, "o", color=ORANGE, markersize=4)
         ax.plot(*abort.steps[-1].end[:, [0, 2]].T, "o", color=INK, markersize=4)
-        ax.set(xlabel="x [m]", title=abort.way)
+        ax.set(xlabel="x [m]", title=abort.way_text)
         ax.set_aspect("equal")
         ax.spines[["top", "right"]].set_visible(False)
     fig.axes[0].set_ylabel("z [m]")

@@ -22,7 +22,7 @@ from rigidfleet.formation.point_files import Points
 from rigidfleet.mission import Mission, show_draft
 from rigidfleet.plotting import encode_figure
 from rigidfleet.plotting.style import apply_style
-from rigidfleet.simulation.trajectories import of_curves
+from rigidfleet.simulation.trajectories import result_of_trajectories
 from rigidfleet.sweep import Sweep, fly
 from rigidfleet.sweep.figures import map_over_two, shares
 
@@ -45,7 +45,7 @@ def show() -> None:
     letters = outlines.slots_on_outlines(outlines.text_outlines("HI"), 100, 2.0)
     scenes = [show_draft.shape_scene(shape, 100, 2.0) for shape in ("sphere", "helix")]
     scenes.append(show_draft.points_scene("logo", Points(letters, None), "logo.csv"))
-    text = show_draft.show_text("my-show", scenes, agents=100, spacing=2.0)
+    text = show_draft.show_mission_text("my-show", scenes, agents=100, spacing=2.0)
     result = rf.simulate(Mission.from_toml(text))
     with TemporaryDirectory() as folder:
         paths = rf.plot(result, folder, formats=["png"], names=["formations", "operation"])
@@ -58,7 +58,7 @@ def words() -> None:
     letters = outlines.slots_on_outlines(outlines.stroke_outlines("FLY"), 60, 2.0)
     scenes = [show_draft.points_scene("FLY", Points(letters, None), "strokes:FLY")]
     result = rf.simulate(
-        Mission.from_toml(show_draft.show_text("fly", scenes, agents=60, spacing=2.0))
+        Mission.from_toml(show_draft.show_mission_text("fly", scenes, agents=60, spacing=2.0))
     )
     with TemporaryDirectory() as folder:
         (path,) = rf.plot(result, folder, formats=["png"], names=["formations"])
@@ -69,7 +69,7 @@ def others() -> None:
     """The picture of a flight that others made, judged as its page says."""
     files = IMAGES.parents[1] / "tests" / "data" / "sequence_trajectories"
     read = read_trajectories(files)
-    result = of_curves(read, separation=0.3, name=files.name)
+    result = result_of_trajectories(read, separation=0.3, name=files.name)
     with TemporaryDirectory() as folder:
         (path,) = rf.plot(result, folder, formats=["png"], names=["clearance"])
         _save_with_few_colours(path, "seven-crazyflies")

@@ -17,7 +17,7 @@ from rigidfleet.math.margins import (
     LoopGains,
     formation_loops,
     largest_pole,
-    margins,
+    stability_margins,
     tracking_loops,
 )
 from rigidfleet.mission import bounds, json_schema, load_mission
@@ -70,7 +70,7 @@ def _keys(schema: dict[str, Any], name: str) -> str:
         for key, entry in part["properties"].items()
         if key not in left_out
     ]
-    return _table(("key", "value", "default", "meaning"), rows)
+    return _table_symbols(("key", "value", "default", "meaning"), rows)
 
 
 def _is_table(entry: dict[str, Any]) -> bool:
@@ -129,14 +129,14 @@ def _default(entry: dict[str, Any], given: bool) -> str:
         case None | "" | [] | [None]:
             return ""
         case [value]:
-            return _short(value)
+            return _shorten_text(value)
         case list() as values:
-            return f"[{', '.join(map(_short, values))}]"
+            return f"[{', '.join(map(_shorten_text, values))}]"
         case value:
-            return _short(value)
+            return _shorten_text(value)
 
 
-def _short(value: Any) -> str:
+def _shorten_text(value: Any) -> str:
     return _quoted(value) if isinstance(value, bool | str) else f"{value:.6g}"
 
 
@@ -149,7 +149,7 @@ def _quoted(value: Any) -> str:
 def _shapes() -> str:
     """The named shapes: name, agents, slots."""
     rows = [(f"`{name}`", agents_taken(name), shape.text) for name, shape in SHAPES.items()]
-    return _table(("shape", "agents", "slots"), rows)
+    return _table_symbols(("shape", "agents", "slots"), rows)
 
 
 def _missions() -> str:
@@ -160,7 +160,7 @@ def _missions() -> str:
         for name in names:
             mission = load_mission(name)
             rows.append((f"`{name}`", mission.title, mission.source))
-    return _table(("mission", "what it shows", "in the paper"), rows)
+    return _table_symbols(("mission", "what it shows", "in the paper"), rows)
 
 
 def _result() -> str:
@@ -170,7 +170,7 @@ def _result() -> str:
         for name, v in VARIABLES.items()
     ]
     along = "; ".join(f"`{dim}`: {', '.join(names)}" for dim, names in LABELS.items())
-    return f"{_table(('variable', 'dimensions', 'unit', 'meaning'), rows)}\n\n{along}."
+    return f"{_table_symbols(('variable', 'dimensions', 'unit', 'meaning'), rows)}\n\n{along}."
 
 
 def _bounds() -> str:
@@ -196,7 +196,7 @@ def _bounds() -> str:
         ("heights of a height map", f"{bounds.HEIGHTS:,}"),
         ("the heaviest vehicle over the lightest", f"{bounds.MASS_RATIO:g}"),
     ]
-    return _table(("what", "at most"), rows)
+    return _table_symbols(("what", "at most"), rows)
 
 
 def _magnitudes() -> str:
@@ -206,13 +206,13 @@ def _magnitudes() -> str:
         for name, b in vars(bounds).items()
         if isinstance(b, bounds.Bound)
     ]
-    return _table(("quantity", "least, where it must be > 0", "most", "unit"), rows)
+    return _table_symbols(("quantity", "least, where it must be > 0", "most", "unit"), rows)
 
 
 def _metrics() -> str:
     """The metrics of a sweep: name, unit, meaning."""
     rows = [(f"`{name}`", m.unit, m.text.replace("|", "\\|")) for name, m in METRICS.items()]
-    return _table(("metric", "unit", "meaning"), rows)
+    return _table_symbols(("metric", "unit", "meaning"), rows)
 
 
 def _drill() -> str:
@@ -223,7 +223,7 @@ def _drill() -> str:
         for default in [field.default]
         for magnitudes in [default if isinstance(default, tuple) else (default,)]
     ]
-    return _table(("key", "default", "meaning"), rows)
+    return _table_symbols(("key", "default", "meaning"), rows)
 
 
 #: Attitude gains [1/s^2, 1/s] and time constant of the rotors [s]; docs/vehicles.md names the sources.
@@ -242,7 +242,10 @@ def _margins() -> str:
         for delay in (0.0, 0.02, 0.05):
             lag = Lag(k_R, k_omega, tau, delay, rate=500.0)
             loops = formation_loops(p, [[0, 1], [0, 2], [1, 2]], [1.0] * 3, law, [lag] * 3)
-            held, alone = margins(loops, law), margins(tracking_loops([lag]), law)
+            held, alone = (
+                stability_margins(loops, law),
+                stability_margins(tracking_loops([lag]), law),
+            )
             rule = 8 / 9 / (k_omega / k_R + tau + delay)
             rows.append(
                 (
@@ -261,10 +264,10 @@ def _margins() -> str:
         "vehicle", "delay [ms]", "largest p [1/s]", "8/(9τ)", "constraint law at p = 2",
         "tracking", "its gains, times up to",
     )  # fmt: skip
-    return _table(head, rows)
+    return _table_symbols(head, rows)
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+def _table_symbols(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     lines = [head, ("---",) * len(head), *rows]
     return "\n".join(f"| {' | '.join(row)} |" for row in lines)
 

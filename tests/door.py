@@ -151,7 +151,7 @@ def fly(seed: Sequence[int], k: int) -> Flight:
         flight = _drawn(np.random.default_rng([*seed, k, attempt]), kind, slow=k % 8 in (0, 5, 6))
         flight.folder, flight.staggered = k // 4 % 3 == 2, k // 4 % 2 == 1
         if flight.staggered:
-            _stagger(flight)
+            _expand_stagger(flight)
         flight.numbers = measure(flight.times, flight.places)
         inner = measure([t[3:-3] for t in flight.times], [r[3:-3] for r in flight.places])
         near = flight.numbers.separation
@@ -162,7 +162,7 @@ def fly(seed: Sequence[int], k: int) -> Flight:
     raise AssertionError("no such flight")
 
 
-def _stagger(flight: Flight) -> None:
+def _expand_stagger(flight: Flight) -> None:
     """Give vehicles stamps of their own, within a step of each other; the ways are those through the new samples."""
     for i in range(len(flight.names)):
         by = int(np.diff(flight.times[i])[0]) * i // len(flight.names)

@@ -355,14 +355,18 @@ def reach_of(
     """Of each test: whether it passes, how long it takes [s], and the functions of files that it calls."""
     sources = hashlib.sha256(b"".join(x.read_bytes() for x in sorted(PACKAGE.rglob("*.py"))))
 
-    def name_of(item: pytest.Item) -> str:
+    def path_of_keys(item: pytest.Item) -> str:
         """Name of a test with the code that it was known for: that of the package and of its file."""
         digest = sources.copy()
         digest.update(item.path.read_bytes())
         return f"{digest.hexdigest()[:16]} {item.nodeid}"
 
     known = json.loads(kept.read_text()) if kept and kept.exists() else {}
-    reach = {item.nodeid: known[name_of(item)] for item in session.items if name_of(item) in known}
+    reach = {
+        item.nodeid: known[path_of_keys(item)]
+        for item in session.items
+        if path_of_keys(item) in known
+    }
     paths = {str(PACKAGE / file): file for file in files}
 
     def learn(item: pytest.Item, out: Path) -> None:
@@ -386,7 +390,7 @@ def reach_of(
         reach[item.nodeid] = {"passes": False, "why": "died", "s": took, "reaches": []} | (
             wrote or {}
         )
-        known[name_of(item)] = reach[item.nodeid]
+        known[path_of_keys(item)] = reach[item.nodeid]
     if kept:
         kept.write_text(json.dumps(known))
     return reach
@@ -466,7 +470,7 @@ def fly_with(plain: str) -> None:
 
     def clearances(watch: Any, problem: Any, state: Any, first: int, end: int, s: Any) -> None:
         for step in range(first, end):
-            row = monitor.row_of(step, state)
+            row = monitor.trail_row_of(step, state)
             t, h = state.trail.clock[row]
             obstacles.watch_step(state.trail.points[row], t, h, problem, s, watch.monitor)
 

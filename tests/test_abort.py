@@ -14,7 +14,7 @@ import pytest
 import rigidfleet as rf
 from rigidfleet.cli.app import main
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.planning.abort import Aborts, _levels
+from rigidfleet.planning.abort import Aborts, _altitude_levels
 from rigidfleet.planning.legs import state_at_start
 from rigidfleet.planning.losses import legs_from
 from rigidfleet.planning.timing import complete_times
@@ -99,16 +99,16 @@ def flown_apart(seed: int, *, rotors: bool = False) -> float:
     def apart(mission: Mission, since: float) -> float:
         result = rf.simulate(mission)
         assert result.complete
-        assert since == 0.0 or result.time[-1] == pytest.approx(abort.end, abs=1e-6)
+        assert since == 0.0 or result.time[-1] == pytest.approx(abort.rest_time, abs=1e-6)
         r = result.position[result.time >= since]
         if gone.any() and since > 0.0:
             assert np.linalg.norm(r[:, left] - r[:, [lost]], axis=2).min() > 0.3
         return float(np.linalg.norm(r[:, i] - r[:, j], axis=2).min()) - 0.3
 
-    if not abort.way:
-        if "'lost agent" in abort.reason:
+    if not abort.way_text:
+        if "'lost agent" in abort.why_no_way:
             return np.inf
-        assert "the plan itself" in abort.reason
+        assert "the plan itself" in abort.why_no_way
         data = mission.to_dict()
         assert apart(Mission.from_dict(data | {"abort": {}, "disturbances": {}}), 0.0) < 0.3
         return np.inf
@@ -191,8 +191,8 @@ def test_every_second_has_a_way_home_and_no_two_come_nearer(to: str) -> None:
     start = aborts.mission.fleet.position
     i, j = np.triu_indices(len(start), 1)
     for abort in aborts.all_aborts():
-        assert abort.way, abort.reason
-        r = abort.positions_at(np.linspace(abort.begins, abort.end, 1500))
+        assert abort.way_text, abort.why_no_way
+        r = abort.positions_at(np.linspace(abort.begins, abort.rest_time, 1500))
         least = float(np.linalg.norm(r[:, i] - r[:, j], axis=2).min()) - 2.0 * 0.15
         proved = abort.certificate.separation
         assert least >= proved - 1e-9
@@ -202,7 +202,7 @@ def test_every_second_has_a_way_home_and_no_two_come_nearer(to: str) -> None:
         last = abort.steps[-1].end
         order = np.linalg.norm(last[:, None, :2] - start[:, :2], axis=2).argmin(axis=1)
         assert sorted(order) == list(range(len(start)))
-        planned = abort.way == "lands as planned"
+        planned = abort.way_text == "lands as planned"
         assert to == "any" or planned or (order == np.arange(len(start))).all()
         assert np.allclose(last[:, :2], start[order, :2], atol=0.01)
 
@@ -263,7 +263,7 @@ def test_files_of_vehicles_lead_home_from_every_second(tmp_path: Path, name: str
     back = 0
     for abort, planned in zip(table["aborts"], check.aborts, strict=True):
         if abort["ways"] is None:
-            assert planned.way == "lands as planned"
+            assert planned.way_text == "lands as planned"
             continue
         steps = table["ways"][str(abort["ways"])]
         end = abort["stops_s"] + sum(x["duration_s"] for x in steps)
@@ -308,7 +308,7 @@ def test_what_follows_if_one_does_not_hear() -> None:
     abort = aborts.abort_at(7.0)
     each = aborts.nearness_if_not_heard(abort)
     told = min(each)
-    t = plain.time[(plain.time > abort.begins) & (plain.time < min(abort.end, 24.0))]
+    t = plain.time[(plain.time > abort.begins) & (plain.time < min(abort.rest_time, 24.0))]
     r, on = abort.positions_at(t), plain.position[np.searchsorted(plain.time, t)]
     n = aborts.mission.n_agents
     best = np.full(n, np.inf)
@@ -326,7 +326,7 @@ def test_levels_keep_who_is_above() -> None:
     """Of two ways that cross as seen from above, levels differ; who is above at first has the higher level."""
     rng = np.random.default_rng(4)
     p, q = rng.uniform(0.0, 6.0, (30, 3)), rng.uniform(0.0, 12.0, (30, 3))
-    level = _levels(1.0, p, q)
+    level = _altitude_levels(1.0, p, q)
     s = np.linspace(0.0, 1.0, 2001)[:, None]
     crossing = 0
     for i, j in itertools.combinations(range(30), 2):
@@ -409,7 +409,7 @@ def test_some_leave_and_the_others_fly_on(agents: list[int], T: float) -> None:
     assert np.abs(result.position[-1] - plain.position[-1]).max() < 0.02
     abort = aborts_of(mission).abort_at(T)
     i, j = np.triu_indices(12, 1)
-    r = abort.positions_at(np.linspace(abort.begins, abort.end, 3000))
+    r = abort.positions_at(np.linspace(abort.begins, abort.rest_time, 3000))
     assert (
         np.linalg.norm(r[:, i] - r[:, j], axis=2).min() - 0.3 >= abort.certificate.separation - 1e-9
     )
@@ -425,8 +425,8 @@ def test_what_stands_in_the_way_is_named() -> None:
     data["agents"]["position"] = [[x, y, 12.0] for x, y, _ in data["agents"]["position"]]
     aborts = aborts_of(complete_times(Mission.from_dict(data | legs)))
     abort = aborts.abort_at(2.0)
-    assert not abort.way
-    assert "there is no ground to land on" in abort.reason
+    assert not abort.way_text
+    assert "there is no ground to land on" in abort.why_no_way
     roof = {
         "name": "roof",
         "kind": "box",
@@ -436,8 +436,8 @@ def test_what_stands_in_the_way_is_named() -> None:
     }
     mission = complete_times(Mission.from_dict(data | {"obstacles": [{"kind": "ground"}, roof]}))
     abort = aborts_of(mission).abort_at(2.0)
-    assert not abort.way
-    assert "'roof' stands in the way" in abort.reason
+    assert not abort.way_text
+    assert "'roof' stands in the way" in abort.why_no_way
     result = rf.simulate(Mission.from_dict(mission.to_dict() | {"abort": {"at": 2.0}}))
     assert not result.complete
     assert "'roof' stands in the way" in result.ending
@@ -448,7 +448,7 @@ def test_what_flies_past_fast_is_seen_between_slow_samples() -> None:
     """A ball of 0.6 m at 30 m/s that crosses the way down of a vehicle leaves it no such way, if it hits it."""
     data = show().to_dict()
     abort = aborts_of(show()).abort_at(12.0)
-    down = abort.end - 0.5 * abort.steps[-1].duration
+    down = abort.rest_time - 0.5 * abort.steps[-1].duration
     x, y, z = abort.positions_at(np.array([down]))[0, 6].tolist()
     hits = set()
     for late in (0.0, 0.5, 2.0, 3.5):
@@ -464,7 +464,7 @@ def test_what_flies_past_fast_is_seen_between_slow_samples() -> None:
         far = r - np.column_stack([centre, 0.0 * t + y, 0.0 * t + z])[:, None]
         hit = np.linalg.norm(far, axis=2).min() < 0.6 + 0.15
         hits.add(bool(hit))
-        assert (planned.way == abort.way) == (not hit)
+        assert (planned.way_text == abort.way_text) == (not hit)
     assert hits == {True, False}
 
 
@@ -491,9 +491,9 @@ def test_ways_home_stay_within_fences() -> None:
         entered.append(0)
         for t in (21.0, 24.0, 28.0):
             abort = aborts.abort_at(t)
-            assert abort.way
+            assert abort.way_text
             x, y, z = np.moveaxis(
-                abort.positions_at(np.linspace(abort.begins, abort.end, 3000)), 2, 0
+                abort.positions_at(np.linspace(abort.begins, abort.rest_time, 3000)), 2, 0
             )
             entered[-1] += bool(((x > 3.0) & (x < 6.0) & (np.abs(y) < 1.5) & (z < 6.0)).any())
     assert entered[0] > 0
@@ -582,5 +582,5 @@ def test_a_thousand_come_home_from_every_second(to: str) -> None:
         complete_times(Mission.from_dict(mission.to_dict() | {"abort": {"to": to}}))
     )
     assert len(check.aborts) == 81
-    assert all(x.way for x in check.aborts)
+    assert all(x.way_text for x in check.aborts)
     assert check.least_separation >= 0.8

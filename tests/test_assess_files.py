@@ -15,7 +15,7 @@ import rigidfleet as rf
 from rigidfleet.cli.app import BAD_INPUT, FAILED, PASSED, main
 from rigidfleet.foreign import shows, texts
 from rigidfleet.foreign.files import read_trajectories
-from rigidfleet.simulation.trajectories import of_curves
+from rigidfleet.simulation.trajectories import result_of_trajectories
 
 SEVEN = Path(__file__).parent / "data" / "sequence_trajectories"
 HEAD = "time_s,x_m,y_m,z_m"
@@ -24,7 +24,7 @@ HEAD = "time_s,x_m,y_m,z_m"
 def judged(files, interpolation="cubic", **given):
     """The verdict on files, and the result."""
     read = read_trajectories(files, interpolation)
-    result = of_curves(read._replace(away=False), **given)
+    result = result_of_trajectories(read._replace(away=False), **given)
     return rf.assess(result), result
 
 
@@ -142,7 +142,7 @@ def test_a_drone_that_takes_off_later_stays_until_then(tmp_path):
     path = show(tmp_path / "late.skyc", [first, first], **{"drones/1.json": late})
     read = read_trajectories(path)
     assert read.curves[1].time.tolist() == [3.0, 5.0]
-    result = of_curves(read._replace(away=False))
+    result = result_of_trajectories(read._replace(away=False))
     assert result.time[-1] == 5.0
     assert not result.position[result.time < 2.9][:, 1].any()
     assert "stays at its first and last place" in read.notes[0]
@@ -166,7 +166,9 @@ def test_columns_may_have_any_order(own, tmp_path):
     turned = tmp_path / "turned.csv"
     turned.write_text("\n".join(",".join(reversed(line)) for line in lines))
     for a, b in zip(
-        texts.read_table(own.read_bytes()), texts.read_table(turned.read_bytes()), strict=True
+        texts.read_result_table(own.read_bytes()),
+        texts.read_result_table(turned.read_bytes()),
+        strict=True,
     ):
         np.testing.assert_array_equal(a.pieces, b.pieces)
     first, second = read_trajectories(own), read_trajectories(turned)

@@ -14,10 +14,10 @@ from rigidfleet.assessment import Verdict, safety
 from rigidfleet.assessment.verdict import CheckResult
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.preflight.check import check as foresee
-from rigidfleet.reporting import html_page
+from rigidfleet.reporting import report_page
 from rigidfleet.result import Extremum, Result
 from rigidfleet.simulation.together import simulate_together
-from rigidfleet.sweep.metrics import METRICS, measure
+from rigidfleet.sweep.metrics import METRICS, measure_metrics
 
 #: Limits by direction that no flight here reaches.
 FREE = {
@@ -120,14 +120,14 @@ def test_no_value_of_a_shipped_flight_is_understated(name):
 def test_body_axes_come_to_the_same_limits_by_direction():
     """Both formulations have the same greatest speeds and accelerations by direction."""
     one, other = (
-        flown("narrow-passage", 1.0, **({"formulation": kind} | _short("narrow-passage")))[1]
+        flown("narrow-passage", 1.0, **({"formulation": kind} | _shorten_text("narrow-passage")))[1]
         for kind in ("inertial", "body")
     )
     for name in FREE:
         assert one[name].worst == pytest.approx(other[name].worst, rel=1e-4), name
 
 
-def _short(name: str) -> dict[str, Any]:
+def _shorten_text(name: str) -> dict[str, Any]:
     return {"phases": load_mission(name).to_dict()["phases"][:2]}
 
 
@@ -135,7 +135,7 @@ def test_flights_side_by_side_have_the_limits_by_direction_of_single_ones():
     """What a sweep finds of eight flights in wind is what each finds alone."""
     missions = []
     for k in range(8):
-        data = load_mission("windy-passage").to_dict() | _short("windy-passage")
+        data = load_mission("windy-passage").to_dict() | _shorten_text("windy-passage")
         data["disturbances"]["gusts"]["seed"] = k
         missions.append(Mission.from_dict(data | {"limits": FREE, "output_step": 1.0}))
     for result, mission in zip(simulate_together(missions), missions, strict=True):
@@ -187,7 +187,7 @@ def test_curves_of_others_have_limits_by_direction_in_closed_form():
 
 def test_what_is_known_at_samples_alone_is_marked_in_table_json_and_report(tmp_path):
     """An older file, which has no extremes by direction, is judged by its samples, and says so in every form."""
-    result, _ = flown("windy-passage", 1.0, **_short("windy-passage"))
+    result, _ = flown("windy-passage", 1.0, **_shorten_text("windy-passage"))
     for phase in result.phases:
         for name in FREE:
             phase.extremes.pop(name)
@@ -205,16 +205,18 @@ def test_what_is_known_at_samples_alone_is_marked_in_table_json_and_report(tmp_p
     rows = {row.quantity: row.worst for row in safety(old, verdict) if row.worst is not None}
     assert rows["horizontal speed"].at_samples
     assert not rows["speed"].at_samples
-    assert "horizontal acceleration, at samples" in html_page([old])
+    assert "horizontal acceleration, at samples" in report_page([old])
 
 
 def test_every_limit_that_fails_a_flight_is_a_metric_of_a_sweep():
     """A limit of 1 cm/s or 1 cm/s^2 fails a flight, and a sweep keeps the value that failed it."""
     for name in ("speed", "acceleration", *FREE):
-        result, found = flown("windy-passage", 1.0, limits={name: 0.01}, **_short("windy-passage"))
+        result, found = flown(
+            "windy-passage", 1.0, limits={name: 0.01}, **_shorten_text("windy-passage")
+        )
         verdict = rf.assess(result)
         assert not found[name].passed
-        assert measure(result, verdict)[name] == found[name].worst
+        assert measure_metrics(result, verdict)[name] == found[name].worst
         assert name in METRICS
 
 
@@ -276,7 +278,7 @@ def test_the_obstacle_that_is_hit_first_is_named(obstacles, what, when, tmp_path
 def test_report_and_replay_name_the_first_contact():
     """Both pages name the sill, which is hit before the ground."""
     result = straight([GROUND, SILL])
-    page = html_page([result])
+    page = report_page([result])
     assert "agent 1 hits &#39;sill&#39;, first at 1.38 s" in page
     assert "first agent 1, sill" in page
     assert "agent 1 first hits sill" in rf.replay(result).html

@@ -32,14 +32,14 @@ def code(answer: int) -> bytes:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     text = "define i64 @{}(i64, i64, i64, i64) {{ ret i64 {} }}"
-    symbols = map(objects.symbol, objects.ENTRIES["flight"])
+    symbols = map(objects.symbol_name, objects.ENTRIES["flight"])
     module = llvm.parse_assembly("\n".join(text.format(name, answer) for name in symbols))
     return objects.target_machine().emit_object(module)
 
 
 def answer() -> int:
     """Which machine code a new process would call."""
-    found = native._load("flight")
+    found = native._load_library("flight")
     return found.integrate(0, 0, 0, 0)
 
 
@@ -57,7 +57,7 @@ def base(tmp_path, monkeypatch) -> Iterator[Path]:
     monkeypatch.setattr(native, "_compile", lambda _: [code(OWN)])
     monkeypatch.setattr(native, "_loaded", {})
     file = native._cache_file("flight")
-    file.write_bytes(objects.concatenate([code(PLANTED)]))
+    file.write_bytes(objects.join_objects([code(PLANTED)]))
     file.chmod(0o600)
     forget()
     yield folder
@@ -378,7 +378,7 @@ def test_workers_compile_nothing_that_cannot_be_kept(base, monkeypatch):
     forget()
     monkeypatch.setattr(native, "_loaded", {})
     monkeypatch.setattr(native, "_compile", refused)
-    native.inherit(given)
+    native.inherit_code(given)
     assert native.library().integrate(0, 0, 0, 0) == OWN
     assert jit.jit(lambda x: 3.0 * x)(1.0) == 3.0  # and do not warn again
     assert native.code_to_inherit() == given

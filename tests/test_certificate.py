@@ -13,7 +13,7 @@ from rigidfleet import MissionError, assess, check, simulate
 from rigidfleet.formation import assignment, shapes
 from rigidfleet.math.products import product_in_blocks
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.result import Result
 
 
@@ -147,7 +147,7 @@ def show(n: int = 30, **keys: Any) -> Mission:
 
 def test_a_certificate_is_the_least_separation_of_ten_thousand_samples():
     """Of each phase of a tour: the value, the pair and the time."""
-    for planned in preview(show())[0]:
+    for planned in preview_phases(show())[0]:
         proof = planned.certificate
         assert proof is not None
         assert proof.how == "closed form"

@@ -1031,13 +1031,13 @@ def test_progress_words(monkeypatch):
     monkeypatch.setattr(console, "perf_counter", lambda: 0.0)
     watch = console.FlightWatch()
     watch.update(Progress(0.0, 90.0, "WP0", 1.0))
-    assert watch._words() == "0.0 of 90 s  WP0"
+    assert watch._progress_text() == "0.0 of 90 s  WP0"
     watch.update(Progress(30.0, 90.0, "WP3", 3.0))
-    assert watch._words() == "30.0 of 90 s  x15  0:04 left  WP3"
+    assert watch._progress_text() == "30.0 of 90 s  x15  0:04 left  WP3"
     watch.update(Progress(30.5, 90.0, "WP3", 23.0))
-    assert watch._words() == "30.5 of 90 s  x0.03  39:40 left  WP3"
+    assert watch._progress_text() == "30.5 of 90 s  x0.03  39:40 left  WP3"
     watch.update(Progress(90.0, 90.0, "WP3", 24.0))
-    assert watch._words() == "90.0 of 90 s  WP3"
+    assert watch._progress_text() == "90.0 of 90 s  WP3"
 
 
 def test_progress_of_phases_that_differ(monkeypatch):
@@ -1049,11 +1049,11 @@ def test_progress_of_phases_that_differ(monkeypatch):
     watch.update(Progress(0.0, 81.0, "take off", 0.0))
     now = 0.1
     watch.update(Progress(12.0, 81.0, "sphere", 0.1, planning=True))
-    assert watch._words() == "12.0 of 81 s  sphere  (planning)"
+    assert watch._progress_text() == "12.0 of 81 s  sphere  (planning)"
     now = 4.0
-    assert watch._words() == "12.0 of 81 s  x3.0  0:23 left  sphere  (planning)"
+    assert watch._progress_text() == "12.0 of 81 s  x3.0  0:23 left  sphere  (planning)"
     now = 10.2  # by now what was flown in no time is long ago
-    assert watch._words() == "12.0 of 81 s  sphere  (planning)"
+    assert watch._progress_text() == "12.0 of 81 s  sphere  (planning)"
 
 
 def test_progress_leaves_compiling_out(monkeypatch):
@@ -1070,7 +1070,7 @@ def test_progress_leaves_compiling_out(monkeypatch):
     watch.update(Progress(20.0, 90.0, "WP1", 12.9))
     now = 13.4
     watch.update(Progress(24.0, 90.0, "WP1", 13.4))
-    assert watch._words() == "24.0 of 90 s  x10  0:07 left  WP1"
+    assert watch._progress_text() == "24.0 of 90 s  x10  0:07 left  WP1"
 
 
 def test_progress_on_a_terminal(monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from rigidfleet import assess, simulate
-from rigidfleet.kernel.disturbances import spline
+from rigidfleet.kernel.disturbances import spline_value
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning import disturbances
 from rigidfleet.result import Result
@@ -46,10 +46,10 @@ def test_the_kernels_spline_is_scipys():
     table, out = spline_coefficients(y), np.empty((2, 3))
     reference = CubicSpline(0.3 * np.arange(20), y, bc_type="natural")
     for t in (0.0, 0.123, 0.3, 2.9, 5.6999, 5.7):
-        spline(t, 0.3, table, out)
+        spline_value(t, 0.3, table, out)
         np.testing.assert_allclose(out, reference(t), atol=1e-12)
     for t, end in ((-1.0, 0), (9.0, -1), (1e300, -1)):
-        spline(t, 0.3, table, out)
+        spline_value(t, 0.3, table, out)
         np.testing.assert_allclose(out, y[end], atol=1e-12)
 
 
@@ -64,7 +64,7 @@ def test_gusts_of_a_mission_have_the_stated_statistics():
     gusts = FIRST | {"intensity": sigma, "correlation": 0.4, "seed": 5}
     long = [{"kind": "hold", "control": "open", "duration": 2000.0}]
     wind = np.array([3.0, 4.0, 0.0])
-    d = disturbances.disturbance(
+    d = disturbances.mission_disturbance(
         mission({"wind": wind, "gusts": gusts}, phases=long, output_step=1.0)
     )
     u = knots(d.gust)
@@ -85,7 +85,7 @@ def test_dryden_gusts_have_drydens_spectrum():
     m = mission({"wind": [3.0, 0, 0], "gusts": gusts}, phases=long, output_step=1.0)
     from scipy.signal import welch
 
-    d = disturbances.disturbance(m)
+    d = disturbances.mission_disturbance(m)
     f, S = welch(knots(d.gust), 1 / d.gust_step, nperseg=1024, axis=0)
     S = S.mean(axis=1)  # over agents
     x = 2.0 * 2 * np.pi * f  # L omega / V
@@ -105,7 +105,7 @@ def test_altitude_gives_lengths_and_intensities():
     gusts = {"model": "dryden", "altitude": 20.0, "seed": 3}
     long = [{"kind": "hold", "control": "open", "duration": 4000.0}]
     m = mission({"wind": [0.0, 5.0, 0.0], "gusts": gusts}, phases=long, output_step=1.0)
-    u = knots(disturbances.disturbance(m).gust)
+    u = knots(disturbances.mission_disturbance(m).gust)
     factor = 0.177 + 0.000823 * 20 / 0.3048
     assert u[..., 2].std() == pytest.approx(0.5, rel=0.05)
     assert u[..., :2].std() == pytest.approx(0.5 / factor**0.4, rel=0.1)
@@ -115,7 +115,7 @@ def test_noise_has_the_stated_deviation():
     """At the sensor's ticks the noise has the stated deviations and is white; between them it falls to 0.87 of them."""
     noise = {"position": 0.02, "velocity": 0.1, "rate": 20.0, "seed": 4}
     long = [{"kind": "hold", "control": "open", "duration": 500.0}]
-    d = disturbances.disturbance(mission({"noise": noise}, phases=long))
+    d = disturbances.mission_disturbance(mission({"noise": noise}, phases=long))
     assert d.noise_step == 0.05
     for table, sigma in ((d.noise_r, 0.02), (d.noise_v, 0.1)):
         x = knots(table)
@@ -131,7 +131,7 @@ def test_a_longer_mission_meets_the_same_air():
     """Gusts and noise of a mission twice as long begin alike, to where the spline's end shows."""
     tables = {"gusts": FIRST, "noise": {"position": 0.1}}
     d, long = (
-        disturbances.disturbance(mission(tables, phases=[OPEN[0] | {"duration": t}]))
+        disturbances.mission_disturbance(mission(tables, phases=[OPEN[0] | {"duration": t}]))
         for t in (10.0, 20.0)
     )
     for a, b in ((d.gust, long.gust), (d.noise_r, long.noise_r)):
@@ -176,12 +176,12 @@ def test_the_constraint_law_is_not_told():
     ]
     tables: dict[str, Any] = {"phases": phases, "agents": {"mass": 1.0}}
     m = mission(air, **tables)
-    d, calm = disturbances.disturbance(m), m.to_dict()
+    d, calm = disturbances.mission_disturbance(m), m.to_dict()
     del calm["disturbances"]
 
     def force(t, r, v):
         u = np.empty_like(r)
-        spline(t, d.gust_step, d.gust, u)
+        spline_value(t, d.gust_step, d.gust, u)
         return d.drag[:, None] * (d.wind + u - v)
 
     def worst(result):
@@ -257,7 +257,7 @@ def test_laws_see_noise_and_newton_does_not():
     result = simulate(m)
     assert result.measured_position is not None
     assert result.measured_velocity is not None
-    table = knots(disturbances.disturbance(m).noise_r)
+    table = knots(disturbances.mission_disturbance(m).noise_r)
     reference = CubicSpline(0.05 * np.arange(len(table)), table, bc_type="natural")
     error = result.measured_position - result.position
     np.testing.assert_allclose(error, reference(result.time), atol=1e-12)
@@ -298,7 +298,9 @@ def test_a_users_controller_sees_what_is_measured():
     m = mission({"noise": {"position": 0.5, "rate": 10.0}}, phases=[
         {"kind": "establish", "formation": "triangle", "blend": 0.5, "duration": 1.0}])  # fmt: skip
     result = simulate(m, controller=control, rate=10.0)
-    np.testing.assert_allclose(seen[0][1], knots(disturbances.disturbance(m).noise_r)[0] + START)
+    np.testing.assert_allclose(
+        seen[0][1], knots(disturbances.mission_disturbance(m).noise_r)[0] + START
+    )
     assert result.measured_position is not None
 
 

@@ -11,7 +11,7 @@ from oracles import FULL
 from scipy.signal import butter, lfilter
 
 import rigidfleet as rf
-from rigidfleet.assessment.alignment import align
+from rigidfleet.assessment.alignment import fit_alignment
 from rigidfleet.cli.app import main
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign.curves import ASSUMED, LoggedStates, Trajectories, curve_through_samples
@@ -19,10 +19,10 @@ from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.smoothing import (
     PositionNoise,
     Positions,
+    fit_noise,
     knots_over,
-    noise_of,
     smooth,
-    spline,
+    spline_of_points,
 )
 from rigidfleet.setpoints import ways_of
 from rigidfleet.simulation.as_logged import Doubts, judge_log
@@ -122,7 +122,7 @@ def test_intervals_of_positions_hold(kind: str, count: int) -> None:
         curve = noisy(kind, random).curves[0]
         log = Positions(curve.time, curve.at(curve.time)[:, :3], np.ones(len(curve.time)))
         likely = smooth(log, PositionNoise(SIGMA, tau), knots_over(log.time, 0.0, 0.025))
-        ways = spline(likely.knots, likely.draw(40, random)).at(t)
+        ways = spline_of_points(likely.knots, likely.draw(40, random)).at(t)
         drawn = np.std(ways, axis=2)
         held.append(np.abs(likely.way.at(t) - places(t)[:, 0]) < 1.96 * drawn)
     assert np.mean(held) > 0.9
@@ -212,7 +212,7 @@ def test_noise_is_shown_by_samples(kind: str, tau: float) -> None:
     """White noise and noise of a short correlation time are estimated from the samples alone."""
     log = noisy(kind, np.random.default_rng(6), end=40.0)
     samples = [Positions(c.time, c.at(c.time)[:, :3], np.ones(len(c.time))) for c in log.curves]
-    noise = noise_of(samples, None, 0.05).noise
+    noise = fit_noise(samples, None, 0.05).noise
     assert noise is not None
     assert noise.sigma == pytest.approx(SIGMA, rel=0.1)
     assert noise.tau == pytest.approx(tau, rel=0.3)
@@ -223,7 +223,7 @@ def test_noise_far_from_the_origin_is_told() -> None:
     t = np.arange(0.0, 60.0, 1.0 / RATE)
     x = 20.0 * np.stack([np.sin(0.05 * t), np.cos(0.05 * t), 0.1 * np.sin(0.1 * t)], axis=1)
     noise = SIGMA * np.random.default_rng(0).standard_normal(x.shape)
-    estimate = noise_of([Positions(t, x + noise, np.ones(len(t)))], SIGMA, 0.025)
+    estimate = fit_noise([Positions(t, x + noise, np.ones(len(t)))], SIGMA, 0.025)
     assert estimate.noise == PositionNoise(SIGMA)
     assert not estimate.words
 
@@ -293,7 +293,7 @@ def test_a_show_that_is_set_up_quite_wrong_is_told(turn: float, scale: float) ->
     z = np.exp(1j * np.radians(turn)) * (x[..., 0] + 1j * x[..., 1])
     flown = scale * np.stack([z.real, z.imag, x[..., 2]], axis=2) + [3.0, 4.0, 0.0]
     logs = [(t + 2.3, flown[:, i]) for i in range(3)]
-    known = align(logs, ways, "offset").to_dict()
+    known = fit_alignment(logs, ways, "offset").to_dict()
     assert known["offset_s"][0] == pytest.approx(2.3, abs=0.01)
     assert (known["turn_deg"][0] - turn + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.1)
     assert known["scale"][0] == pytest.approx(scale, rel=1e-3)
@@ -304,7 +304,7 @@ def test_hovering_tells_no_clock() -> None:
     random, t = np.random.default_rng(9), np.arange(0.0, 20.0, 0.05)
     still = Piecewise(np.array([0.0, 20.0]), np.ones((1, 3, 1)))
     logs = [(t, 1.0 + 1e-4 * random.standard_normal((len(t), 3)))]
-    found = align(logs, [still], "recorded").to_dict()
+    found = fit_alignment(logs, [still], "recorded").to_dict()
     assert found["offset_s"] is None
     assert found["turn_deg"] is None
     x = np.ones((len(t), 1, 3))

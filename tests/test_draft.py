@@ -148,7 +148,9 @@ def test_what_cannot_be(asked, words):
 def a_show(shape, agents, spacing=2.0):
     """A show of one named shape."""
     one = show_draft.shape_scene(shape, agents, spacing)
-    return Mission.from_toml(show_draft.show_text("new", [one], agents=agents, spacing=spacing))
+    return Mission.from_toml(
+        show_draft.show_mission_text("new", [one], agents=agents, spacing=spacing)
+    )
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -167,7 +169,7 @@ def test_every_shape_is_shown(shape):
 def test_a_show_flies_and_lands_on_the_pads():
     """It takes off, goes through its formations and back, and passes; each pad has one vehicle again."""
     scenes = [show_draft.shape_scene(shape, 30, 2.0) for shape in ("sphere", "helix", "sphere")]
-    mission = Mission.from_toml(show_draft.show_text("new", scenes, agents=30, spacing=2.0))
+    mission = Mission.from_toml(show_draft.show_mission_text("new", scenes, agents=30, spacing=2.0))
     assert [p.kind for p in mission.phases] == [
         "takeoff", "establish", "reshape", "reshape", "reshape", "land",
     ]  # fmt: skip

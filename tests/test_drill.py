@@ -184,7 +184,7 @@ def compare(folder, seeds, count):
         drilled, rng = Show(show.mission, Drill(files=(show.file,))), np.random.default_rng(seed)
         for fault, size, who, angles, sign in some_faults(show, rng, count):
             truth = brute_force(show, fault, size, who, angles, sign)
-            _, reason, words = drilled.outcome(
+            _, reason, words = drilled.measure_fault(
                 GeometricFault(fault, size, who, Known(angles, sign))
             )
             assert set(filter(None, reason.split(", "))) == truth, (seed, fault, size, who, words)
@@ -212,15 +212,15 @@ def test_a_show_that_is_turned_as_a_whole_is_judged_by_its_fence_alone(tmp_path)
     show, every = day(tmp_path, 3), np.arange(16)
     drilled = Show(show.mission, Drill(files=(show.file,)))
     stream = Known(np.zeros(16), 1.0)
-    before = drilled.outcome(GeometricFault("rotated", 1e-9, every, stream))[0]["separation"]
-    worst, reason, words = drilled.outcome(GeometricFault("rotated", 90.0, every, stream))
+    before = drilled.measure_fault(GeometricFault("rotated", 1e-9, every, stream))[0]["separation"]
+    worst, reason, words = drilled.measure_fault(GeometricFault("rotated", 90.0, every, stream))
     assert reason == "geofence"
     assert "leaves the geofence" in words
     assert worst["separation"] == pytest.approx(before, abs=1e-9)
     data = show.mission.to_dict()
     del data["limits"]["geofence"]
     free = Show(rf.Mission.from_dict(data), Drill(files=(show.file,)))
-    assert free.outcome(GeometricFault("rotated", 90.0, every, stream)) == ({}, "", "")
+    assert free.measure_fault(GeometricFault("rotated", 90.0, every, stream)) == ({}, "", "")
 
 
 def test_in_turn_every_vehicle_has_a_fault():
@@ -392,7 +392,7 @@ def test_a_late_light_is_caught_as_it_is_flown():
     """A light of the shipped change of picture that is late by 2 s comes as near as samples of the file show."""
     result = rf.simulate("change-of-picture")
     show = faults.show_of(rf.load_mission("change-of-picture").text, Drill(late=(2.0,)))
-    worst, reason, words = show.outcome(
+    worst, reason, words = show.measure_fault(
         GeometricFault("late", 2.0, np.array([4]), np.random.default_rng(0))
     )
     t = np.arange(0.0, 33.0, 0.001)
@@ -431,9 +431,9 @@ def test_stale_files_are_flown(tmp_path):
     stale.write_text("\n".join([text[0], *(",".join(f) for f in moved)]) + "\n")
     drilled = Show(show.mission, Drill(files=(show.file,), stale=(show.file, str(stale))))
     stream, first = np.random.default_rng(0), np.array([0])
-    assert drilled.outcome(GeometricFault("stale", 1.0, first, stream))[1] == ""
-    assert "separation" in drilled.outcome(GeometricFault("stale", 2.0, first, stream))[1]
-    assert drilled.outcome(GeometricFault("stale", 2.0, np.array([5]), stream))[1] == ""
+    assert drilled.measure_fault(GeometricFault("stale", 1.0, first, stream))[1] == ""
+    assert "separation" in drilled.measure_fault(GeometricFault("stale", 2.0, first, stream))[1]
+    assert drilled.measure_fault(GeometricFault("stale", 2.0, np.array([5]), stream))[1] == ""
 
 
 def test_vehicles_of_files_keep_their_names(tmp_path):
@@ -454,8 +454,10 @@ def test_vehicles_of_files_keep_their_names(tmp_path):
         file.write_text("\n".join([head, *rows]) + "\n")
     drilled = Show(show.mission, Drill(files=(str(files[0]),), stale=(str(files[1]),)))
     stream = np.random.default_rng(0)
-    assert drilled.outcome(GeometricFault("stale", 1.0, every, stream))[1] == ""
-    failed = drilled.outcome(GeometricFault("shifted", 1.3, every[:1], Known(np.array([0.0]), 1)))
+    assert drilled.measure_fault(GeometricFault("stale", 1.0, every, stream))[1] == ""
+    failed = drilled.measure_fault(
+        GeometricFault("shifted", 1.3, every[:1], Known(np.array([0.0]), 1))
+    )
     assert re.search(r"agents? 1 \(drone \d+\)", failed[2])
 
 

@@ -549,7 +549,7 @@ def test_pieces_are_as_long_as_the_tolerance_allows(flight):
     SciPy makes the same pieces from the closed form's derivatives, and the closed form says how far off they are.
     """
     exported, _ = exported_motion(flight, flown=False)
-    for agent, curve in enumerate(fit_curves(exported.chunks(), 1e-3, yaw_tolerance=10.0)):
+    for agent, curve in enumerate(fit_curves(exported.curve_chunks(), 1e-3, yaw_tolerance=10.0)):
         time = np.unique(flight.time.round(9))
         at = np.searchsorted(time, curve.time.round(9))
         assert len(curve.pieces) > 3

@@ -40,7 +40,7 @@ def wanted(flight):
     return type(due)(*(x[tracked] for x in due))
 
 
-def yaw_of(x, y, z, w):
+def yaw_by_kind(x, y, z, w):
     """Yaw [rad] of a rotation about the vertical."""
     assert (x, y) == (0.0, 0.0)
     return 2.0 * math.atan2(z, w)
@@ -69,7 +69,7 @@ def test_rosbags_reads_mcap(flight, wanted, tmp_path):
             assert header.stamp.sec * 10**9 + header.stamp.nanosec == stamp
             if connection.topic.endswith("pose"):
                 p, q = message.pose.position, message.pose.orientation
-                row = [stamp / 1e9, p.x, p.y, p.z, yaw_of(q.x, q.y, q.z, q.w)]
+                row = [stamp / 1e9, p.x, p.y, p.z, yaw_by_kind(q.x, q.y, q.z, q.w)]
             else:
                 v, w = message.twist.linear, message.twist.angular
                 assert (w.x, w.y) == (0.0, 0.0)
@@ -163,7 +163,7 @@ def test_rerun_reads_rrd(flight, wanted, tmp_path):
         rows = np.array(sorted(found[f"/vehicles/{i + 1}"]))
         assert rows[:, 0] == pytest.approx(wanted.time, abs=1e-6)
         assert rows[:, 1:4] == pytest.approx(wanted.state[:, 0, i], rel=1e-7, abs=1e-6)
-        same_angles([yaw_of(*q) for q in rows[:, 4:]], wanted.yaw[:, i], 1e-6)
+        same_angles([yaw_by_kind(*q) for q in rows[:, 4:]], wanted.yaw[:, i], 1e-6)
 
 
 def test_pygltflib_reads_gltf(flight, tmp_path):

@@ -276,7 +276,7 @@ def test_agents_that_are_passed_over_are_neither_highest_nor_lowest_nor_fastest(
 @pytest.mark.parametrize("formulation", ["inertial", "body"])
 def test_no_distance_changes_more_than_its_bound(formulation, monkeypatch):
     """In space and as seen from above, at nine points of each step; what turns as one body has small bounds."""
-    call, found, mission = watching.native.Watch.bound_moves, [], a_crowd(formulation)
+    call, found, mission = watching.native.Watch.bound_distance_changes, [], a_crowd(formulation)
     n = mission.n_agents
     i, j = np.triu_indices(n, 1)
     basis = bernstein_basis(np.linspace(0.0, 1.0, 9))
@@ -524,7 +524,7 @@ def test_what_goes_wrong_in_the_thread_that_watches_is_raised(monkeypatch):
         patch.setattr(watching.Extremes, "take_steps", fail)
         with pytest.raises(MemoryError, match="no more of it"):
             simulate(mission)
-    done, wait = [], watching.Extremes.wait
+    done, wait = [], watching.Extremes.wait_for_steps
 
     def interrupt(extremes: Any) -> None:
         if extremes._taking is not None and len(done) < 2:

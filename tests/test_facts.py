@@ -17,14 +17,14 @@ from test_sweep import everything
 
 import rigidfleet as rf
 from rigidfleet import plotting
-from rigidfleet._common.facts import Fact, FactTable, Line, Row, Sheet, value, worst_values
+from rigidfleet._common.facts import Fact, FactTable, Line, Row, Sheet, table_of_worst_values, value
 from rigidfleet._common.text import all_hold_in_words
 from rigidfleet.cli import app, console
 from rigidfleet.math.margins import Margins
 from rigidfleet.mission import mission_names
 from rigidfleet.preflight.check import check
-from rigidfleet.reporting import html_page
-from rigidfleet.reporting.contents import contents
+from rigidfleet.reporting import report_page
+from rigidfleet.reporting.contents import page_contents
 from rigidfleet.sweep.summary import summarise
 from rigidfleet.tuning.outcome import Flown, Tuned
 
@@ -318,7 +318,7 @@ def numbers_wanted(data: Any, show: bool) -> dict[tuple[str, str], list[float]]:
 @pytest.mark.usefixtures("quick")
 def test_the_page_has_the_tables_of_its_objects(flights):
     """The report of a flight has the phases of its mission and the tables of its verdict, row by row."""
-    page = html_page(flights[0])
+    page = report_page(flights[0])
     tables = re.findall(r"<table.*?</table>", page, flags=re.DOTALL)
     rows = [row for table in tables for row in rows_of(table)]
     for sheet in (flights[0].mission.facts(), rf.assess(flights[0]).facts()):
@@ -347,8 +347,8 @@ def test_a_show_is_checked_for_what_concerns_it():
 def test_the_report_of_a_show_has_nothing_of_edges():
     """A flight without edges has no gains of edges, no edges counted, and no row without a value."""
     result = rf.simulate(rf.Mission.from_toml(SHOW))
-    page = contents([result], None, None)
-    words = Page(html_page(result)).text
+    page = page_contents([result], None, None)
+    words = Page(report_page(result)).text
     assert not re.search(r"\(0 edges|no edges|overshoot|constraint f|tension|\|c\|", words), words
     checks = page["flights"][0]["checks"][-1]
     assert all(row[1] or row[3] for row in checks.texts)
@@ -358,12 +358,14 @@ def test_the_report_of_a_show_has_nothing_of_edges():
 def test_what_applies_to_no_row_is_not_shown():
     """Columns without a value are left out, names of columns with them, and marks where nothing is judged."""
     facts = [Fact("speed", 3.0, "m/s"), Fact("height", 12345.0, "m")]
-    assert worst_values("what", facts).texts == [["speed", "3 m/s"], ["height", "12345 m"]]
-    assert [name for name, *_ in worst_values("what", facts).columns] == ["what", "worst"]
-    measured = worst_values("what", [*facts, Fact("tilt", 9.0, "deg", interval=(8.5, 9.25))])
+    assert table_of_worst_values("what", facts).texts == [["speed", "3 m/s"], ["height", "12345 m"]]
+    assert [name for name, *_ in table_of_worst_values("what", facts).columns] == ["what", "worst"]
+    measured = table_of_worst_values(
+        "what", [*facts, Fact("tilt", 9.0, "deg", interval=(8.5, 9.25))]
+    )
     assert [name for name, *_ in measured.columns] == ["what", "worst", "true value"]
     assert measured.texts[2] == ["tilt", "9 deg", "8.5 to 9.25"]
-    judged = worst_values("what", [*facts, Fact("tilt", 9.0, "deg", 5.0, level="fails")])
+    judged = table_of_worst_values("what", [*facts, Fact("tilt", 9.0, "deg", 5.0, level="fails")])
     assert judged.texts[-1] == ["tilt", "9 deg", "<= 5 deg", "FAILED"]
 
 

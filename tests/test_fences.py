@@ -19,8 +19,8 @@ from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import boundaries, fences
 from rigidfleet.mission.geojson import read_geojson
 from rigidfleet.mission.schema import GeodeticOrigin
-from rigidfleet.plotting.areas import falls_of
-from rigidfleet.reporting import html_page
+from rigidfleet.plotting.areas import fall_places_by_sample
+from rigidfleet.reporting import report_page
 from rigidfleet.simulation.together import simulate_together
 from rigidfleet.solids.polygons import Region, edges_cross
 
@@ -76,12 +76,12 @@ def test_the_worst_of_a_curve_is_between_no_samples(outside):
     region, sign = Region.of_rings(RINGS, 2.0, 7.0), 1.0 if outside else -1.0
     for points in curves(30):
         dense = (sign * signed(region, along(points, np.linspace(0, 1, 20_001)))).max()
-        value, bound = (x[0] for x in region.depth(points[None], outside=outside))
+        value, bound = (x[0] for x in region.depths_of_curves(points[None], outside=outside))
         assert value <= dense + 1e-9
         assert bound >= dense - 1e-9
 
         def measure(p, _):
-            value, bound = region.depth(p, outside=outside)
+            value, bound = region.depths_of_curves(p, outside=outside)
             return value, np.full(len(p), 0.5), bound
 
         worst = greatest_by_measure(points[None], measure, lambda _: 1e-3)
@@ -126,7 +126,7 @@ def test_a_fall_with_drag_solves_its_differential_equation(k):
         assert tau == pytest.approx(solved.t_events[0][0], rel=1e-9)
         place = falls.landing_places(np.array(start[:3]), np.array(v), tau, np.array(k), wind)
         assert place == pytest.approx(solved.y_events[0][0][:2], abs=1e-6)
-        places = falls.places(np.array(start[:3]), np.array(v), solved.t, k, wind, g)
+        places = falls.fall_places(np.array(start[:3]), np.array(v), solved.t, k, wind, g)
         assert places == pytest.approx(solved.y[:3].T, abs=1e-6)
 
 
@@ -144,7 +144,7 @@ def test_a_fall_ends_on_terrain_where_that_is_hit():
         beside(obstacles=[slope, roof], disturbances={"wind": wind, "drag": 0.3})
     )
     result = rf.simulate(mission)
-    places, k = falls_of(result), mission.drag / mission.true_mass
+    places, k = fall_places_by_sample(result), mission.drag / mission.true_mass
 
     def surface(x, y):
         return (
@@ -198,7 +198,7 @@ def test_a_fall_lands_where_a_vehicle_falls_that_the_flight_loses():
     later = k + 80
     level = float(result.position[later, 1, 2])
     r, v = (x[k : k + 1] for x in states(result))
-    place = boundaries.Boundaries(result.mission).landings(r, v, level)[0, 1]
+    place = boundaries.Boundaries(result.mission).places_of_falls(r, v, level)[0, 1]
     assert result.position[k, 1, 2] - level > 1.0
     assert place == pytest.approx(result.position[later, 1, :2], abs=1e-4)
 
@@ -259,7 +259,7 @@ def test_the_nearest_fall_is_that_of_all_instants_and_heights():
         t = np.linspace(0, 1, 1000)
         r, v = way.states(t, 2)
         nearest = min(
-            region.distance(own.landings(r, v, level).reshape(-1, 2)).min()
+            region.distance(own.places_of_falls(r, v, level).reshape(-1, 2)).min()
             for level in np.linspace(0, 2, 30)
         )
         nearest -= mission.agents.radius[0]
@@ -343,7 +343,7 @@ def test_the_first_page_is_for_those_who_decide():
     mission = rf.Mission.from_dict(beside(people=people, disturbances=wind))
     result = rf.simulate(mission)
     drilled = ["Two seconds late, no two vehicles touch."]
-    text = html_page(result, rehearsed=drilled, abort=["Every second has a way home."])
+    text = report_page(result, rehearsed=drilled, abort=["Every second has a way home."])
     first = re.sub(r"<[^>]+>", " ", text.split("<main>")[1].split("<h2>Safety")[0])
     for words in (
         "3 vehicles fly for 7.5 s", *drilled, "Every second has a way home.", "wind of 5 m/s",
@@ -351,10 +351,10 @@ def test_the_first_page_is_for_those_who_decide():
         hashlib.sha256(result.mission_text.encode()).hexdigest(),
     ):  # fmt: skip
         assert words in first
-    falls_at = boundaries.Boundaries(mission).landings(*states(result), 0.0)
+    falls_at = boundaries.Boundaries(mission).places_of_falls(*states(result), 0.0)
     low, high = falls_at.min(axis=(0, 1)), falls_at.max(axis=(0, 1))
     assert f"x = {low[0]:.1f} and {high[0]:.1f} m, y = {low[1]:.1f} and {high[1]:.1f} m" in first
-    assert "No drill belongs to this report." in html_page(result)
+    assert "No drill belongs to this report." in report_page(result)
 
 
 # -- degrees and files -------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ from rigidfleet.plotting import curves, sketches, space, style
 from rigidfleet.plotting.solids import seen_from_above
 from rigidfleet.result import LABELS, VARIABLES, PhaseRecord, Result
 from rigidfleet.result.quantities import samples
-from rigidfleet.solids.outline import outline
+from rigidfleet.solids.outline import outline_of_solid
 
 START = [[1.0, 6.0, 3.0], [8.0, 3.0, 3.0], [7.0, 6.0, 3.0]]
 TRIANGLE = {"shape": "triangle", "size": 4.0}
@@ -700,7 +700,7 @@ def test_everything_in_space_is_in_the_picture(flight):
     """All agents at all times, all obstacles and waypoints lie inside their part of the trajectory's figure."""
     result = a_flight(**FLIGHTS[flight])
     figure = drawn("trajectory", result)
-    view = space.scene(result)
+    view = space.trajectory_scene(result)
     spatial, above = figure.axes
     points = np.concatenate(
         [result.position.reshape(-1, 3), *(shape.extent for shape in view.shapes)]
@@ -717,7 +717,7 @@ def test_everything_in_space_is_in_the_picture(flight):
 
 def test_the_formation_is_drawn_at_both_ends_and_not_on_top_of_itself(triangle):
     """The first and last sample are drawn, and no two drawn formations lie within each other's shape."""
-    shots = space.scene(triangle).shots
+    shots = space.trajectory_scene(triangle).shots
     assert (shots[0], shots[-1]) == (0, len(triangle.time) - 1)
     assert 3 < len(shots) < 25
     r = triangle.position[shots]
@@ -753,7 +753,7 @@ def test_a_log_beside_its_plan_shows_who_drifted_when():
 def test_a_huge_obstacle_does_not_shrink_the_flight():
     """Of a wall a hundred kilometres long only what stands near the flight is shown."""
     wall = {"kind": "box", "name": "wall", "min": [-1e5, 20.0, 0.0], "max": [1e5, 21.0, 50.0]}
-    near = space.scene(a_flight(mission={"obstacles": [wall]}))
+    near = space.trajectory_scene(a_flight(mission={"obstacles": [wall]}))
     assert near.shapes
     assert np.ptp([near.low, near.high], axis=0).max() < 100
 
@@ -839,7 +839,7 @@ def test_the_figure_of_an_operator():
 def test_an_obstacle_seen_from_above_covers_its_hull(name):
     """What is painted of a convex obstacle from above is as large as the hull that Qhull finds, without holes."""
     for thing in load_mission(name).solids:
-        faces = np.clip(outline(thing.solid).triangles, -100.0, 100.0)
+        faces = np.clip(outline_of_solid(thing.solid).triangles, -100.0, 100.0)
         hull = ConvexHull(faces.reshape(-1, 3)[:, :2])
         figure = Figure(figsize=(4, 4), dpi=100)
         ax = figure.add_axes(

@@ -10,7 +10,7 @@ import rigidfleet as rf
 from rigidfleet.foreign.curves import curve_to_rows, least_jerk_curve
 from rigidfleet.kernel.problem import SHAPE, Reference
 from rigidfleet.kernel.references import blend_slots
-from rigidfleet.math.piecewise import Piecewise, join
+from rigidfleet.math.piecewise import Piecewise, join_curves
 from rigidfleet.planning.derivatives import way_series
 
 SLOTS = [[2.0, 0.0, 0.0], [-1.0, 1.7, 0.0], [-1.0, -1.7, 0.0]]
@@ -55,7 +55,7 @@ def _own() -> np.ndarray:
     return LOOP[:, None] + near[:, None, None] * np.einsum("kab,nb->kna", R, np.array(SLOTS))
 
 
-def _table(position: np.ndarray, agents: bool = True) -> str:
+def _table_symbols(position: np.ndarray, agents: bool = True) -> str:
     rows = ["time_s," + "agent," * agents + "x_m,y_m,z_m"]
     for t, places in zip(TIME, position, strict=True):
         for i, place in enumerate(places.tolist(), start=1):
@@ -128,12 +128,12 @@ def test_each_vehicle_follows_its_own(tmp_path, folder):
             _written(
                 tmp_path,
                 'file = "ways"',
-                content=_table(own[:, i - 1 : i], False),
+                content=_table_symbols(own[:, i - 1 : i], False),
                 file=f"ways/{i}.csv",
             )
         path = tmp_path / "mission.toml"
     else:
-        path = _written(tmp_path, 'file = "way.csv"', content=_table(own))
+        path = _written(tmp_path, 'file = "way.csv"', content=_table_symbols(own))
     result = rf.simulate(path)
     assert rf.assess(result).passed
     for k in (60, 72, 120):
@@ -194,7 +194,7 @@ BAD = {
     "nan": (_loop().replace("0.5000,", "0.5000,nan,", 1).replace("nan,", "nan,", 1), "line"),
     "order": (_loop().replace("0.5000,", "0.3000,", 1), "line 7"),
     "columns": ("a,b,c\n1,2,3\n2,3,4\n", "has no names of columns"),
-    "two vehicles": (_table(_own()[:, :2]), "has 2 trajectories for 3 agents"),
+    "two vehicles": (_table_symbols(_own()[:, :2]), "has 2 trajectories for 3 agents"),
     "jump": (
         "duration," + ",".join(f"{c}^{k}" for c in ("x", "y", "z", "yaw") for k in range(8)) + "\n"
         + "1," + ",".join(["0"] * 16 + ["10"] + ["0"] * 15) + "\n"
@@ -209,7 +209,7 @@ def test_vehicles_follow_what_was_exported(tmp_path, kind, near):
     """A flight that leaves as a show or as ROS 2 poses is followed as it was flown, within the format's deviation."""
     if kind == "mcap":
         pytest.importorskip("mcap", reason="make .venv/.interchange installs it")
-    first = rf.simulate(_written(tmp_path, 'file = "way.csv"', content=_table(_own())))
+    first = rf.simulate(_written(tmp_path, 'file = "way.csv"', content=_table_symbols(_own())))
     file = f"flown.{kind}"
     rf.export(first, tmp_path / file, kind)
     path = tmp_path / "again.toml"
@@ -252,7 +252,7 @@ def test_trajectories_are_joined_at_all_knots():
     """Curves with knots of their own agree with themselves at any time, and stay where they end."""
     one = least_jerk_curve(Piecewise(np.array([0.0, 1.0, 3.0]), np.arange(24.0).reshape(2, 4, 3)))
     two = Piecewise(np.array([0.0, 2.0]), np.arange(8.0).reshape(1, 4, 2))
-    knots, pieces = join([one, two])
+    knots, pieces = join_curves([one, two])
     np.testing.assert_array_equal(knots, [0.0, 1.0, 2.0, 3.0])
     for t in (0.3, 1.7, 2.5):
         k = int(t)

@@ -226,7 +226,7 @@ NUMBERS = [
 
 
 @pytest.fixture(autouse=True)
-def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+def _shorten_text(monkeypatch: pytest.MonkeyPatch) -> None:
     """A phase may take only so many steps, that a case takes a second and no minute."""
     monkeypatch.setattr(tolerances, "_STALLED", 3000)
     monkeypatch.setattr(tolerances, "_STALLED_RATE", 0.0)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.measured import Measured, measurement_of
+from rigidfleet.kernel.measured import Measured, measurement_arrays
 from rigidfleet.math import attitude, constraint_jacobian, proximity, rigid_body
 from rigidfleet.mission import Box, Ground
 
@@ -150,7 +150,7 @@ def measure(x, v, p, m, near) -> Measured:
     K, n = x.shape[:2]
     zero = np.zeros_like(x)
     commanded = near if near.ndim == 3 else np.full((K, 3, 3), np.nan)
-    found = measurement_of(
+    found = measurement_arrays(
         n, 0, K, time=np.arange(K, dtype=float), start=np.array([0, K]), attached=np.ones(1, dtype=bool),
         framed=False, mass=m, lost_at=np.full(n, np.inf), limit=np.full(n, np.inf),
         edges=np.zeros((0, 2), dtype=np.int64), r=x, v=np.ascontiguousarray(v), f_u=zero, f_C=zero, p=p,
@@ -158,7 +158,7 @@ def measure(x, v, p, m, near) -> Measured:
     )  # fmt: skip
     if near.ndim == 2:
         found.work[5, :3, :3] = near
-    native.measure(found)
+    native.measure_samples(found)
     return found
 
 

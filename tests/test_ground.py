@@ -9,7 +9,7 @@ from sample_missions import three_quadrotors
 import rigidfleet as rf
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import MissionError
-from rigidfleet.solids.distance import own_axes, signed_distance
+from rigidfleet.solids.distance import in_own_axes, signed_distance
 
 #: The same level ground at 1 m: everywhere, as terrain, as a roof, and as a roof that is turned.
 LEVEL = {
@@ -40,7 +40,7 @@ def mission(*obstacles, **tables):
 def distance(obstacle, x, y, z):
     """Signed distance [m] from an obstacle to points."""
     solid = mission(obstacle).obstacles[0].solid
-    return signed_distance(*own_axes(x, y, z, 0, solid), 0, solid)
+    return signed_distance(*in_own_axes(x, y, z, 0, solid), 0, solid)
 
 
 @pytest.mark.parametrize(

@@ -19,12 +19,12 @@ from rigidfleet.kernel.avoidance import (
     OBSTACLE,
     PAIR,
     avoidance_arrays,
-    candidates,
+    candidate_accelerations,
     initial_sight,
 )
 from rigidfleet.kernel.engine import sampled
 from rigidfleet.kernel.problem import graph, workspace
-from rigidfleet.solids.records import ball, box, half_space, join, one_solid
+from rigidfleet.solids.records import ball, box, half_space, join_solids, one_solid
 
 #: Period of the commands [s].
 T = 0.1
@@ -109,7 +109,8 @@ LOW, HIGH, MIDDLE, SIZE, GROUND = (
     0.6,
     -1.3,
 )
-WALLS = join([one_solid(box(LOW, HIGH)), one_solid(ball(MIDDLE, SIZE)), one_solid(half_space(GROUND))])  # fmt: skip
+SOLIDS = box(LOW, HIGH), ball(MIDDLE, SIZE), half_space(GROUND)
+WALLS = join_solids([one_solid(solid) for solid in SOLIDS])
 
 
 def from_walls(x: np.ndarray) -> list[np.ndarray]:
@@ -190,7 +191,7 @@ def test_each_takes_the_nearest_of_its_accelerations_that_keeps_all_distances(se
         judge = Judge(r, v, drag, 2 * RADIUS + 0.1, RADIUS + 0.1 if walls else None)
         a = crowd.a
         for i in (1, 2, 0):
-            menu = [asked[i], *(B * candidates()), judge.now[i]]
+            menu = [asked[i], *(B * candidate_accelerations()), judge.now[i]]
             off = [np.linalg.norm(c - asked[i]) for c in menu]
             mine = int(np.argmin([np.linalg.norm(c - took[i]) for c in menu]))
             assert took[i] == pytest.approx(menu[mine], abs=1e-9)
@@ -337,7 +338,7 @@ def test_beside_a_ball_that_moves_the_relative_motion_keeps_the_distance(seed, d
         crowd = Crowd(1, solids=thing, clearance=0.1, drag=drag, filtered=False)
         (took,) = crowd([r], [v], [asked])
         of = Beside(r, v, w, drag)
-        menu = [asked, *(B * candidates()), of.braking(), braking(v, drag)]
+        menu = [asked, *(B * candidate_accelerations()), of.braking(), braking(v, drag)]
         off = [np.linalg.norm(c - asked) for c in menu]
         mine = int(np.argmin([np.linalg.norm(c - took) for c in menu]))
         assert took == pytest.approx(menu[mine], abs=1e-9)
@@ -366,7 +367,7 @@ def test_of_two_balls_the_one_that_leaves_less_room_is_the_threat(turned):
     ends, n = np.array([0.0, 60.0]), np.array([0.6, 0.0, 0.8])
     fast = one_solid(ball(-3.0 * n, 0.5), ends, np.outer(ends, 5.3 * n))
     slow = one_solid(ball(3.0 * n, 0.5), ends, np.outer(ends, -5.0 * n))
-    crowd = Crowd(1, solids=join([fast, slow][:: -1 if turned else 1]), filtered=False)
+    crowd = Crowd(1, solids=join_solids([fast, slow][:: -1 if turned else 1]), filtered=False)
     crowd([[0.0, 0, 0]], np.zeros((1, 3)), np.zeros((1, 3)))
     short = {5.3: 0.0, 5.0: 0.0}
     for u in short:
@@ -777,7 +778,7 @@ def test_hulls_of_quadrotors_keep_their_distance(seed):
         a, of = crowd.a, Hulls(crowd, r)
         at_once = u + (1.0 + AHEAD[:, 2] / T) * (a.requested - u)
         for i in (1, 2, 0):
-            menu = [at_once[i], *(B * candidates()), of.now[i]]
+            menu = [at_once[i], *(B * candidate_accelerations()), of.now[i]]
             off = [np.linalg.norm(c - a.wanted[i]) for c in menu]
             mine = int(np.argmin([np.linalg.norm(c - a.chosen[i]) for c in menu]))
             brakes = mine == len(menu) - 1

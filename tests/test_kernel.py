@@ -905,9 +905,9 @@ def test_arrays_have_the_extents_that_the_kernel_is_compiled_for(mission, monkey
         seen.add(type(x).__name__)
         return real(x)
 
-    real = packing.pack_anew
-    monkeypatch.setattr(packing, "pack_anew", pack)
-    monkeypatch.setattr(native, "pack_anew", pack)
+    real = packing.pack_uncached
+    monkeypatch.setattr(packing, "pack_uncached", pack)
+    monkeypatch.setattr(native, "pack_uncached", pack)
     packing._last.packed.clear()
     simulate(mission).evaluate()
     assert {"Problem", "Workspace", "IntegratorState", "Monitor", "Record", "Segment"} <= seen
@@ -968,5 +968,5 @@ def test_codes_of_an_array_fill_it():
         records.FIRST_ROW,
     )  # fmt: skip
     assert sorted(counted) == list(range(len(state.count)))
-    watch = records.monitor(np.ones(1), np.zeros((0, 6)), np.zeros((0, 6)), 6, 3)
+    watch = records.new_monitor(np.ones(1), np.zeros((0, 6)), np.zeros((0, 6)), 6, 3)
     assert len(watch.count) == records.STAYED + 1

@@ -13,7 +13,7 @@ from rigidfleet.mission.kinds import KINDS
 from rigidfleet.planning import legs, timing
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg, leg_of
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.preflight.losses import planned_answer
 from rigidfleet.result import Result
@@ -32,7 +32,7 @@ def planned_legs(mission: Mission, result: Result) -> list[Leg]:
     """
     mission = complete_times(mission)
     first = mission.first_loss if mission.on_loss != "continue" else np.inf
-    found = [planned.leg for planned in preview(mission)[0]]
+    found = [planned.leg for planned in preview_phases(mission)[0]]
     sure = True
     for k, record in enumerate(result.phases):
         if record.t_start >= first:
@@ -323,7 +323,7 @@ def test_a_phase_departs_once(monkeypatch):
         "align_slots": 2,
     }  # up to the last automatic time
     count.clear()
-    preview(mission)
+    preview_phases(mission)
     assert count == once
     count.clear()
     rf.simulate(mission)

@@ -33,23 +33,23 @@ def test_levels_are_those_of_the_loader():
     runs = set(re.findall(r"(x86-64-v\d) \(supported", listed))
     if "x86-64-v" not in listed:
         pytest.skip("a loader that does not tell")
-    assert set(levels.machine_levels()) == runs & set(levels.LEVELS)
+    assert set(levels.instruction_levels()) == runs & set(levels.LEVELS)
 
 
 @pytest.fixture
 def machine(monkeypatch):
     """A machine of the lower level, in whose environment no level is fixed."""
     monkeypatch.delenv(levels.KEY, raising=False)
-    monkeypatch.setattr(levels, "machine_levels", lambda: ("x86-64-v3",))
+    monkeypatch.setattr(levels, "instruction_levels", lambda: ("x86-64-v3",))
 
 
 def test_the_highest_level_is_taken(monkeypatch, machine):
     """Without the key the level is the machine's highest, and where there are no levels, this very machine."""
-    assert levels.runnable_level() == "x86-64-v3"
-    monkeypatch.setattr(levels, "machine_levels", lambda: levels.LEVELS)
-    assert levels.runnable_level() == "x86-64-v4"
-    monkeypatch.setattr(levels, "machine_levels", tuple)
-    assert levels.runnable_level() == levels.HOST
+    assert levels.runnable_instruction_level() == "x86-64-v3"
+    monkeypatch.setattr(levels, "instruction_levels", lambda: levels.LEVELS)
+    assert levels.runnable_instruction_level() == "x86-64-v4"
+    monkeypatch.setattr(levels, "instruction_levels", tuple)
+    assert levels.runnable_instruction_level() == levels.HOST
 
 
 @pytest.mark.parametrize("fixed", ["x86-64-v4", "x86-64-v9", "v3"])
@@ -72,9 +72,9 @@ def shipped(base, tmp_path, monkeypatch):  # noqa: F811
     )
     monkeypatch.setattr(native, "shared_object_path", objects.shared_object_path)
     source = tmp_path / "code.c"
-    names = map(objects.symbol, objects.ENTRIES["flight"])
+    names = map(objects.symbol_name, objects.ENTRIES["flight"])
     source.write_text("\n".join(f"long {x}(long a) {{ return {SHIPPED}; }}" for x in names))
-    file = objects.shared_object_path(levels.target_level(), cache.sources_digest())
+    file = objects.shared_object_path(levels.target_instruction_level(), cache.sources_digest())
     subprocess.run(["cc", "-shared", "-fPIC", "-o", file, source], check=True)
     return file
 
@@ -91,7 +91,7 @@ def test_shipped_code_is_loaded(shipped, monkeypatch):
 def test_code_of_other_sources_is_not_loaded(shipped, base):  # noqa: F811
     """Where the installed sources are not those that the code was made of, they are compiled, with a warning; what was
     compiled of them is then taken from the cache, without one."""
-    shipped.rename(shipped.with_name(f"{levels.target_level()}-0123456789abcdef.so"))
+    shipped.rename(shipped.with_name(f"{levels.target_instruction_level()}-0123456789abcdef.so"))
     (file,) = base.rglob("flight-*.o")
     file.unlink()
     assert not native.is_compiled()
@@ -137,7 +137,7 @@ def test_the_compiler_serves_the_level(monkeypatch):
         done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
         return done.stdout.split()
 
-    runs = levels.machine_levels()
+    runs = levels.instruction_levels()
     if not runs:
         pytest.skip("no levels here")
     assert of()[0] == "None"

@@ -13,7 +13,7 @@ from sample_flights import WORD, bitmap, swarm, word
 from rigidfleet import plotting
 from rigidfleet.interchange import FORMATS, export
 from rigidfleet.result.lights import lights, plane_view, view_angles
-from rigidfleet.web.replay import html_page
+from rigidfleet.web.replay import replay_page
 
 AMBER = np.array([255, 176, 0]) / 255
 
@@ -73,7 +73,7 @@ def test_figures_of_paths_show_lights(flight, name):
 def test_pictures_are_by_day_without_lights():
     """A flight whose formations have no colours has a light page and figure, and the colours of its agents."""
     made = swarm(4, 4.0)
-    info = json.loads(html_page(made).split('id="info">')[1].split("</script>")[0])
+    info = json.loads(replay_page(made).split('id="info">')[1].split("</script>")[0])
     assert "night" not in info
     assert "light" not in {column["name"] for column in info["columns"]}
     assert np.median(image(plotting.formations(made))) == 1.0
@@ -116,7 +116,7 @@ def test_the_page_has_lights(flight):
     """The replay is at night, seen from in front, and its samples have the colours."""
     from test_replay import parts
 
-    info, columns = parts(html_page(flight))
+    info, columns = parts(replay_page(flight))
     assert info["night"]
     assert math.degrees(info["azimuth"]) == pytest.approx(-90, abs=0.1)
     time = info["start"] + info["step"] * np.arange(info["count"])

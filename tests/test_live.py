@@ -32,7 +32,7 @@ from rigidfleet.web.live.guarding import with_avoidance
 from rigidfleet.web.live.pilot import TICK, Gust, Pilot
 from rigidfleet.web.live.server import Server
 from rigidfleet.web.live.session import Session
-from rigidfleet.web.replay import html_page as replay_page
+from rigidfleet.web.replay import replay_page
 
 TRIANGLE = load_mission("narrow-passage")  # triangle and line
 
@@ -611,17 +611,17 @@ def test_every_mission_by_hand(name):
 def test_commands():
     """Commands do what they say, and anything else is refused."""
     session = Session(TRIANGLE)
-    session.command({"move": [1, 0, 0], "turn": [0, 0, 0.5]})
+    session.execute_command({"move": [1, 0, 0], "turn": [0, 0, 0.5]})
     assert session.pilot.target.move.tolist() == [1, 0, 0]
-    session.command({"formation": "line"})
+    session.execute_command({"formation": "line"})
     assert session.pilot.waiting == "line"
-    session.command({"gust": [0, 1, 0], "strength": 1e9})
+    session.execute_command({"gust": [0, 1, 0], "strength": 1e9})
     assert session.pilot.gusts[0].strength == 20.0
-    session.command({"pause": True})
-    session.command({"speed": 2})
+    session.execute_command({"pause": True})
+    session.execute_command({"speed": 2})
     assert (session.paused, session.speed) == (True, 2.0)
     first = session.pilot
-    session.command({"again": True})
+    session.execute_command({"again": True})
     assert session.pilot is not first
     for wrong in (
         {}, {"move": [1, 0], "turn": [0, 0, 0]}, {"move": [1, 0, "x"], "turn": [0, 0, 0]},
@@ -630,8 +630,8 @@ def test_commands():
         {"gust": [1e-320, 0, 0], "strength": 1}, {"pause": 1}, {"speed": 3}, {"stop": 1},
     ):  # fmt: skip
         with pytest.raises(ValueError, match=r"\w"):
-            session.command(wrong)
-    session.command({"stop": True})
+            session.execute_command(wrong)
+    session.execute_command({"stop": True})
     assert session.stopped.is_set()
 
 
@@ -659,7 +659,7 @@ def test_samples_are_the_flight():
     assert len(numbers) == 1 + 9 * n + 3 + 8 + m + (n + 3) + 7 + 4 * balls.AT_ONCE + (2 + n)
     position = numbers[1 : 1 + 3 * n].reshape(n, 3)
     np.testing.assert_allclose(position, TRIANGLE.agents.position, atol=0.05)
-    session.command({"stop": True})
+    session.execute_command({"stop": True})
     thread.join(5)
     assert not thread.is_alive()
     while (last := messages.get(timeout=5)) is not None:
@@ -674,16 +674,16 @@ def test_real_time():
     thread.start()
     marks = []
     for speed in (1, 2):
-        session.command({"speed": speed})
+        session.execute_command({"speed": speed})
         t, begun = session.pilot.t, time.monotonic()
         time.sleep(1.0)
         marks.append((session.pilot.t - t) / (time.monotonic() - begun))
-        session.command({"pause": True})
+        session.execute_command({"pause": True})
         time.sleep(0.15)
         t = session.pilot.t
         time.sleep(0.2)
         assert session.pilot.t == t
-        session.command({"pause": False})
+        session.execute_command({"pause": False})
     session.stop()
     session.remove_page(messages)
     thread.join(5)

@@ -19,7 +19,7 @@ from rigidfleet.errors import ResultError, TrajectoryError
 from rigidfleet.foreign.files import read_trajectories
 from rigidfleet.math.geodesy import enu_of
 from rigidfleet.simulation.as_logged import Doubts, judge_log
-from rigidfleet.simulation.trajectories import of_curves
+from rigidfleet.simulation.trajectories import result_of_trajectories
 
 LOGS = Path(__file__).parent / "data" / "logs"
 #: A folder with further public logs, such as pyulog's tests, which are too large to be kept.
@@ -470,7 +470,7 @@ def test_logs_share_a_clock_by_gnss_or_have_none(tmp_path):
     assert bare.own_clocks
     assert said(bare, "each vehicle has a clock of its own")
     with pytest.raises(ResultError, match="v0, v1: each has a clock of its own"):
-        of_curves(bare)
+        result_of_trajectories(bare)
 
 
 def test_origins_of_several_logs_are_one(tmp_path):

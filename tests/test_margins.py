@@ -16,14 +16,14 @@ from rigidfleet.math.margins import (
     formation_loops,
     is_stable,
     largest_pole,
-    margins,
+    stability_margins,
     tracking_loops,
 )
 from rigidfleet.physics import constraint_force
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.vehicles import vehicle_lags
 from rigidfleet.preflight.check import check
-from rigidfleet.preflight.margins import formation_laws
+from rigidfleet.preflight.margins import formation_closed_loops
 
 TRIANGLE = 4 / math.sqrt(3) * np.array(
     [[math.cos(t), math.sin(t), 0.0] for t in np.deg2rad([90, 210, 330])]
@@ -82,7 +82,7 @@ def test_exact_law_takes_all_that_it_sees():
 def test_tracking_of_a_delayed_point():
     """L = k e^(-s d) / s: gain margin pi / (2 k d), phase margin pi/2 - k d, delay margin pi / (2 k) - d."""
     k, d = 3.0, 0.1
-    found = margins(tracking_loops([Lag(point=True, delay=d)]), LoopGains(k1=0.0, k2=k))
+    found = stability_margins(tracking_loops([Lag(point=True, delay=d)]), LoopGains(k1=0.0, k2=k))
     assert found.stable
     assert found.gain == (0.0, pytest.approx(math.pi / (2 * k * d), rel=1e-9))
     assert found.phase == pytest.approx(math.pi / 2 - k * d, rel=1e-9)
@@ -133,7 +133,7 @@ def test_margins_are_those_of_python_control(lag, delay, constrained):
     if delay:
         L = L * control.tf(*control.pade(delay, 8))
     gains, phases, _, _, at, _ = control.stability_margins(L, returnall=True)
-    found = margins(loops, law)
+    found = stability_margins(loops, law)
     assert found.stable
     assert found.gain[0] == pytest.approx(max(gains[gains < 1]), rel=1e-4)
     assert found.gain[1] == pytest.approx(min(gains[gains > 1]), rel=1e-4)
@@ -144,7 +144,7 @@ def test_margins_are_those_of_python_control(lag, delay, constrained):
 def test_a_heading_is_no_other_shape():
     """A cube that turns about the vertical for a quarter has the loops of one cube, not of each heading."""
     m = rf.load_mission("cube-by-neighbours")
-    laws, _ = formation_laws(m, preview(m)[0], vehicle_lags(m))
+    laws, _ = formation_closed_loops(m, preview_phases(m)[0], vehicle_lags(m))
     assert [law.where for law in laws].count("'cube'") == 1
 
 
@@ -297,7 +297,7 @@ def test_delay_margin_is_the_delay_that_flies():
     """A triangle flies with 0.9 of the computed delay margin added, and no longer with 1.1 of it."""
     rate, law, m = 200.0, LoopGains(), np.ones(3)
     edges = complete_graph(3)
-    more = margins(
+    more = stability_margins(
         formation_loops(TRIANGLE, edges, m, law, [delayed(LIGHT, 0.02, rate)] * 3), law
     ).delay
     for share in (0.9, 1.1):
@@ -309,7 +309,7 @@ def test_an_attitude_that_is_unstable_by_itself():
     """Where k_omega < tau k_R the attitude itself is unstable, and so is every loop."""
     lag = Lag(k_R=500.0, k_omega=20.0, tau=0.05)
     assert not lag.stable
-    assert not margins(tracking_loops([lag]), LoopGains()).stable
+    assert not stability_margins(tracking_loops([lag]), LoopGains()).stable
     assert largest_pole(tracking_loops([lag]), LoopGains()) == 0.0
 
 
@@ -358,7 +358,7 @@ def test_check_tells_margins():
     )  # fmt: skip
     assert found.margins is not None
     line = found.margins.formations["'line'"]
-    assert line.margins.phase == pytest.approx(margins(alone, law).phase, rel=1e-3)
+    assert line.margins.phase == pytest.approx(stability_margins(alone, law).phase, rel=1e-3)
     assert found.data()["margins"]["formations"]["'line'"]["largest_p"] == line.largest_pole
 
 

@@ -37,7 +37,7 @@ class Watched:
         self.radius = np.broadcast_to(np.asarray(radius, dtype=float), self.n).copy()
         extra = np.zeros((*r.shape[:2], 10)) if body is None else np.concatenate(body, axis=2)
         points = np.ascontiguousarray(np.concatenate([r, v, extra], axis=2))
-        problem, _, state = packing.examples()[:3]
+        problem, _, state = packing.example_tuples()[:3]
         vehicles = problem.vehicles._replace(m=np.ones(self.n))
         self.problem = problem._replace(vehicles=vehicles, body_formulation=body is not None)
         trail = Trail(
@@ -53,7 +53,7 @@ class Watched:
             "altitude": math.inf, "pairs": pairs, "columns": pairs, "struck": np.zeros((0, 2), dtype=np.int64),
         } | changes  # fmt: skip
         self.watch = native.Watch(
-            records.monitor(
+            records.new_monitor(
                 self.radius, none if boxes is None else boxes, none if fence is None else fence, points.shape[2], 0,
                 **every,
             )
@@ -317,7 +317,7 @@ def test_no_distance_changes_by_more_than_its_bound(seed, body):
     outcome = Watched(
         r, 0 * r, np.array([[0.0, 0.5]]), radius=0.1, left=left, body=axes, pairs=none, columns=none
     )
-    outcome.watch.bound_moves(outcome.problem, outcome.state)
+    outcome.watch.bound_distance_changes(outcome.problem, outcome.state)
     space, above = outcome.monitor.moves
     x = (sampled(r) @ T.swapaxes(2, 3))[0, :, :4]
     i, j = np.triu_indices(4, 1)
@@ -344,7 +344,7 @@ def test_one_that_moves_alone_changes_its_distances_by_its_way(axis):
     r[0, :, 9 + axis] += KNOTS
     none = np.zeros((0, 2), dtype=np.int64)
     outcome = Watched(r, 0 * r, np.array([[0.0, 0.5]]), radius=0.1, pairs=none, columns=none)
-    outcome.watch.bound_moves(outcome.problem, outcome.state)
+    outcome.watch.bound_distance_changes(outcome.problem, outcome.state)
     assert 0.95 <= outcome.monitor.moves[0] <= 2.0
 
 

@@ -12,7 +12,7 @@ from rigidfleet.kernel import fleet
 from rigidfleet.kernel.avoidance import KNOWN, UNKNOWN, avoidance_arrays, initial_sight
 from rigidfleet.kernel.engine import sampled
 from rigidfleet.kernel.problem import graph, workspace
-from rigidfleet.solids.records import ball, box, half_space, join, one_solid
+from rigidfleet.solids.records import ball, box, half_space, join_solids, one_solid
 
 #: Period of the commands [s].
 T = 0.02
@@ -25,7 +25,7 @@ class One:
         plan = planned("square", 0, fleet.VehicleDynamics(1.0, point=True), h=T)
         edges, mass = np.zeros((0, 2), dtype=np.int64), np.ones(1)
         self.problem, self.work = plan[0]._replace(graph=graph(edges, mass)), workspace(1, 0)
-        points = fleet.quadrotors([fleet.VehicleDynamics(1.0, point=True)], 0.0)
+        points = fleet.quadrotor_arrays([fleet.VehicleDynamics(1.0, point=True)], 0.0)
         self.flight = fleet.ideal_flight(points, start=0.0, h=T, steps=1)
         self.state = fleet.initial_state(self.flight, np.zeros((1, fleet.STATES)), self.work)
         seen = {
@@ -57,7 +57,7 @@ def passing(place, velocity, radius=0.7):
 def test_the_filter_is_the_conditional_mean(swerve):
     """Estimate and variance are those of the Gaussian of all places and velocities, given all measurements at once."""
     noise, ticks, velocity = 0.05, 30, np.array([1.0, -2.0, 0.5])
-    things = join([one_solid(half_space(-90.0)), passing([5.0, 0, 0], velocity)])
+    things = join_solids([one_solid(half_space(-90.0)), passing([5.0, 0, 0], velocity)])
     fly = One(things, reach=50.0, noise=noise, swerve=swerve, seed=3)
     for k in range(ticks):
         fly(k * T, np.zeros(3), np.zeros(3), np.zeros(3))

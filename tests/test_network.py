@@ -76,7 +76,7 @@ def laid_out(m: rf.Mission, r: Floats | None = None, *, h: float | None = None) 
 def fly(problem: Any, work: Any, flight: Any, state: Any, ticks: int) -> None:
     """Fly some ticks."""
     t_end = state.clock[fleet.TIME] + ticks * flight.steps * flight.h
-    call = fleet.segment(len(state.S), len(work.c), t_end)
+    call = fleet.sampled_segment(len(state.S), len(work.c), t_end)
     assert sampled.fly_ticks(problem, work, flight, state, call) == FINISHED
 
 
@@ -121,7 +121,9 @@ def test_no_vehicle_reads_another_ones_state(network):
                     stamp % len(mail.post) == k and j == sender for stamp, sender in arriving
                 ):
                     mail.post[k, j] = np.nan
-        call = fleet.segment(8, len(work.c), state.clock[fleet.TIME] + flight.h * flight.steps)
+        call = fleet.sampled_segment(
+            8, len(work.c), state.clock[fleet.TIME] + flight.h * flight.steps
+        )
         sampled.fly_ticks(
             problem, work, flight, alone, call
         )  # ends at once: the others have no force
@@ -387,7 +389,7 @@ def test_live_flying_loses_messages():
     session = Session(mission({}))
     for _ in range(20):
         session.pilot.step()
-    session.command({"loss": 0.9})
+    session.execute_command({"loss": 0.9})
     before = session.pilot.result().messages
     for _ in range(200):
         session.pilot.step()

@@ -14,7 +14,7 @@ from rigidfleet.kernel import fleet
 from rigidfleet.kernel.mail import LOST, SENT
 from rigidfleet.math import pid
 from rigidfleet.math.margins import GROWTH
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.vehicles import vehicle_lags
 from rigidfleet.preflight.linear_flight import LinearFlight
 from rigidfleet.preflight.network import (
@@ -42,7 +42,7 @@ def still(
 
 def linear_flight(m: rf.Mission) -> LinearFlight:
     """The linear flight of its formation."""
-    ((_, flight, _),) = linear_flights(m, preview(m)[0], vehicle_lags(m))
+    ((_, flight, _),) = linear_flights(m, preview_phases(m)[0], vehicle_lags(m))
     return flight
 
 

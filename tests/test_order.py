@@ -10,7 +10,12 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
 import rigidfleet as rf
-from rigidfleet.planning.body_layer import Detour, least_distance, nearest_accelerations, rigid_rows
+from rigidfleet.planning.body_layer import (
+    Detour,
+    least_norm_solution,
+    nearest_accelerations,
+    rigid_motion_rows,
+)
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock
 from rigidfleet.simulation.leading import Leader, LeaderState
@@ -81,7 +86,7 @@ def test_the_clock_follows_three_lags_and_never_runs_backwards_or_faster(steps):
     clock, state = VirtualClock(), np.array([0.0, 1.0, 0.0, 0.0])
     elapsed = 0.0
     for target, duration, omega in steps:
-        clock.aim(target, omega)
+        clock.set_aim(target, omega)
         k = clock.omega
 
         def law(_, y, k=k, target=target):
@@ -125,7 +130,7 @@ def led(phase, deviation, clock):
 def test_a_path_at_the_clock_s_time_obeys_the_chain_rule(phase):
     """What is flown is r(tau(t)): its velocity and acceleration are the differences of its places, to rounding."""
     clock = VirtualClock()
-    clock.aim(0.0, 2.0)
+    clock.set_aim(0.0, 2.0)
     clock.advance(0.9)
     leader = led(phase, Detour(), clock)
     h = 0.1
@@ -160,7 +165,7 @@ def test_the_body_is_steered_as_an_independent_solver_would(seed):
     masses, arms, scale = rng.uniform(0.5, 2.0, n), rng.normal(size=(n, 3)), rng.uniform(0.7, 1.3)
     normals = rng.normal(size=(6, 3)) + [2.0, 0.0, 0.0]  # so that there is a solution
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    rows = rigid_rows(normals, arms[rng.integers(n, size=6)], scale)
+    rows = rigid_motion_rows(normals, arms[rng.integers(n, size=6)], scale)
     asked, needed = rng.normal(size=7), rng.normal(size=6) + 1.0
     found = nearest_accelerations(asked, rows, needed, masses, arms, scale)
     assert found is not None
@@ -181,8 +186,10 @@ def test_the_body_is_steered_as_an_independent_solver_would(seed):
 
 def test_contradictory_rows_have_no_least_distance():
     """x >= 1 and -x >= 1: no motion of the body satisfies both, and none is made up."""
-    assert least_distance(np.array([[1.0], [-1.0]]), np.ones(2)) is None
-    assert least_distance(np.array([[1.0], [2.0]]), np.array([1.0, 3.0])) == pytest.approx([1.5])
+    assert least_norm_solution(np.array([[1.0], [-1.0]]), np.ones(2)) is None
+    assert least_norm_solution(np.array([[1.0], [2.0]]), np.array([1.0, 3.0])) == pytest.approx(
+        [1.5]
+    )
 
 
 @pytest.mark.parametrize("dt", [0.0, 0.04, 0.1])
@@ -195,7 +202,7 @@ def test_a_deviation_moves_as_its_derivatives_say(dt):
     asked, e = np.linspace(-1.0, 1.0, 7), 1e-4
     before, now, after = (given_.state_after(dt + k * e, asked, 0.1) for k in (-1, 0, 1))
     for part in range(3):
-        x, y, z = (each.series()[part] for each in (before, now, after))
+        x, y, z = (each.taylor_series()[part] for each in (before, now, after))
         np.testing.assert_allclose(y[1], (z[0] - x[0]) / (2 * e), atol=1e-3)
         np.testing.assert_allclose(2.0 * y[2], (z[0] - 2 * y[0] + x[0]) / e**2, atol=0.06)
     np.testing.assert_allclose(now.Q @ now.Q.T, np.eye(3), atol=1e-12)

@@ -7,7 +7,7 @@ import pytest
 
 import rigidfleet as rf
 from rigidfleet.errors import FlightError
-from rigidfleet.simulation.own_laws import View, plain_copy
+from rigidfleet.simulation.own_laws import View, immutable_copy
 
 TRIANGLE = [[0.0, 0.0, 20.0], [4.0, 0.0, 20.0], [2.0, 3.5, 20.0]]
 SLOTS = [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [2.0, 3.5, 0.0]]
@@ -224,7 +224,7 @@ def test_a_lost_vehicle_is_known_by_its_silence_alone():
 def test_messages_are_copies_that_nobody_can_change():
     """Numbers, arrays and what contains them arrive as they were when they were said; their numbers are counted."""
     array = np.arange(3.0)
-    copy, size = plain_copy({"a": array, "b": [1, 2.5, (True, np.float64(3.0))]})
+    copy, size = immutable_copy({"a": array, "b": [1, 2.5, (True, np.float64(3.0))]})
     array[:] = 9.0
     assert size == 7
     assert copy["a"].tolist() == [0.0, 1.0, 2.0]
@@ -328,7 +328,7 @@ def test_a_sweep_flies_own_laws_by_name(tmp_path, monkeypatch):
     """Rows are those of `simulate` with the law, over runs that vary what links lose."""
     from rigidfleet.assessment import assess
     from rigidfleet.sweep import Sweep, fly
-    from rigidfleet.sweep.metrics import measure
+    from rigidfleet.sweep.metrics import measure_metrics
 
     (tmp_path / "a_law_of_each.py").write_text(LAW)
     monkeypatch.syspath_prepend(tmp_path)
@@ -338,7 +338,7 @@ def test_a_sweep_flies_own_laws_by_name(tmp_path, monkeypatch):
     table = fly(sweep, "swept", workers=1)
     for k in range(2):
         flown = rf.simulate(sweep.mission_of(k), agent=sweep.law[0])
-        assert measure(flown, assess(flown))["thrust"] == table.metrics["thrust"][k]
+        assert measure_metrics(flown, assess(flown))["thrust"] == table.metrics["thrust"][k]
     assert Sweep.from_json(sweep.json()).version == sweep.version
     assert "a_law_of_each:Own" in sweep.version
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BPoly, BSpline, CubicSpline, KroghInterpolator, PPoly
 
-from rigidfleet.math.piecewise import Piecewise, common_knots, join, piece_at
+from rigidfleet.math.piecewise import Piecewise, common_knots, join_curves, piece_index
 
 RNG = np.random.default_rng(7)
 TIME = 3.0 + np.cumsum(RNG.uniform(0.3, 1.5, 9))
@@ -34,9 +34,9 @@ def test_values_and_derivatives_are_those_of_scipy():
     states = curve.states(t, 8)
     for order in range(8):
         np.testing.assert_allclose(states[order], known(t, order), rtol=1e-9, atol=1e-9)
-        taylor = curve.series(t, 8)[order]
+        taylor = curve.taylor_coefficients(t, 8)[order]
         np.testing.assert_allclose(taylor, known(t, order) / factorial(order), rtol=1e-9, atol=1e-9)
-    begin, end = curve.ends(3)
+    begin, end = curve.states_at_ends(3)
     for order in range(3):
         np.testing.assert_allclose(begin[order], known(TIME[:-1], order), atol=1e-12)
         left = known(np.nextafter(TIME[1:], 0.0), order)
@@ -52,8 +52,8 @@ def test_the_piece_at_a_time():
     """The later one at a knot, or the earlier if that is asked for; the outer ones beyond the ends."""
     knots = np.array([0.0, 1.0, 2.0, 4.0])
     t = np.array([-1.0, 0.0, 1.0, 1.5, 2.0, 4.0, 9.0])
-    np.testing.assert_array_equal(piece_at(knots, t), [0, 0, 1, 1, 2, 2, 2])
-    np.testing.assert_array_equal(piece_at(knots, t, "left"), [0, 0, 0, 1, 1, 2, 2])
+    np.testing.assert_array_equal(piece_index(knots, t), [0, 0, 1, 1, 2, 2, 2])
+    np.testing.assert_array_equal(piece_index(knots, t, "left"), [0, 0, 0, 1, 1, 2, 2])
 
 
 @pytest.mark.parametrize("orders", [1, 2, 3, 4])
@@ -69,7 +69,7 @@ def test_hermite_meets_all_derivatives(orders):
     t = np.linspace(*TIME[:2], 7)
     np.testing.assert_allclose(curve.at(t), krogh(t), rtol=1e-8, atol=1e-8)
     apart = Piecewise.of_ends(TIME, states[:, :-1] + 1.0, states[:, 1:])
-    np.testing.assert_allclose(apart.ends(orders)[0], states[:, :-1] + 1.0, atol=1e-9)
+    np.testing.assert_allclose(apart.states_at_ends(orders)[0], states[:, :-1] + 1.0, atol=1e-9)
     np.testing.assert_allclose(apart.jumps(orders), 1.0, rtol=1e-7)
 
 
@@ -78,8 +78,8 @@ def test_a_cubic_spline_is_that_of_scipy():
     x = normal(len(TIME), 2, 3)
     curve, known = Piecewise.cubic_spline(TIME, x), CubicSpline(TIME, x)
     np.testing.assert_allclose(curve.at(INSIDE), known(INSIDE), atol=1e-12)
-    np.testing.assert_allclose(curve.rate().at(INSIDE), known(INSIDE, 1), atol=1e-11)
-    np.testing.assert_allclose(curve.part(2, 4).at(TIME[2:5]), x[2:5], atol=1e-12)
+    np.testing.assert_allclose(curve.derivative_curve().at(INSIDE), known(INSIDE, 1), atol=1e-11)
+    np.testing.assert_allclose(curve.slice_pieces(2, 4).at(TIME[2:5]), x[2:5], atol=1e-12)
 
 
 def test_a_uniform_b_spline_is_that_of_scipy():
@@ -110,7 +110,7 @@ def test_cuts_parts_and_later_ones_are_the_same_curve():
     for other in (cut, part, curve.refine(np.union1d(TIME, [1.0, 20.0]))):
         t = np.linspace(other.time[0], other.time[-1], 60)[:-1]  # at its end the next one begins
         np.testing.assert_allclose(other.at(t), curve.at(t), rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(curve.later(2.0).at(INSIDE + 2.0), curve.at(INSIDE), atol=1e-10)
+    np.testing.assert_allclose(curve.shift_time(2.0).at(INSIDE + 2.0), curve.at(INSIDE), atol=1e-10)
 
 
 def test_curves_are_joined_at_all_knots():
@@ -118,7 +118,7 @@ def test_curves_are_joined_at_all_knots():
     spans = [TIME[:6] + 1e-10, TIME[2:], TIME[[0, 3, 8]]]
     splines = [CubicSpline(t, normal(len(t), 4)) for t in spans]
     curves = [Piecewise(s.x, np.moveaxis(s.c[::-1], 0, -1)) for s in splines]
-    both = join(curves)
+    both = join_curves(curves)
     assert len(both.time) == len(common_knots(curves)) == len(TIME)
     assert both.pieces.shape == (8, 3, 4, 4)
     for i, (t, spline) in enumerate(zip(spans, splines, strict=True)):
@@ -127,7 +127,7 @@ def test_curves_are_joined_at_all_knots():
     with pytest.raises(
         ValueError, match="3 trajectories with 9 times in all are more than 10 coeff"
     ):
-        join(curves, 10)
+        join_curves(curves, 10)
 
 
 def test_another_start_fades():

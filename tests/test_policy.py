@@ -13,11 +13,11 @@ from sample_flights import swarm
 
 from rigidfleet import plotting
 from rigidfleet.mission import Mission
-from rigidfleet.reporting import html_page as report_page
+from rigidfleet.reporting import report_page
 from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.web.live.session import Session
 from rigidfleet.web.policy import content_policy
-from rigidfleet.web.replay import html_page as replay_page
+from rigidfleet.web.replay import replay_page
 
 #: What has been got through into pages elsewhere: ends of elements, handlers, comments, templates, odd lines.
 HOSTILE = (

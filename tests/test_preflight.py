@@ -13,8 +13,8 @@ from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.formation.shapes import slots
 from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.mission import Mission, load_mission, mission_names
-from rigidfleet.planning.preview import preview
-from rigidfleet.plotting.graph import graphs
+from rigidfleet.planning.preview import preview_phases
+from rigidfleet.plotting.graph import formation_graphs
 from rigidfleet.preflight.check import check
 from rigidfleet.preflight.formations import STARTS
 from rigidfleet.simulation.flight import simulate
@@ -71,7 +71,7 @@ def test_planned_way_is_the_flown(name):
     """The way is planned within 4 cm of where all agents fly, phase by phase, wherever slots are tracked."""
     flown = load_mission(name)
     record = simulate(flown)
-    way, known = preview(flown)
+    way, known = preview_phases(flown)
     assert known
     for planned, phase in zip(way, flown.phases, strict=True):
         if phase.control != "tracking":
@@ -358,12 +358,12 @@ def test_figure_shows_flexes_and_redundant_edges():
     phases = [{"kind": "establish", "formation": "square", "until": 5.0}]
     whole = mission(phases=phases)
     judged = {f.name: f.rigidity for f in check(whole).formations}
-    (ax,) = graphs(whole, judged).axes
+    (ax,) = formation_graphs(whole, judged).axes
     assert {line.get_linestyle() for line in ax.lines if "edge" in str(line.get_gid())} == {"--"}
     assert any("flex-1" in gid for gid in arrows(ax))
     triangle = load_mission("single-waypoint")
     judged = {f.name: f.rigidity for f in check(triangle).formations}
-    (ax,) = graphs(triangle, judged).axes
+    (ax,) = formation_graphs(triangle, judged).axes
     assert {line.get_linestyle() for line in ax.lines if "edge" in str(line.get_gid())} == {"-"}
     assert not arrows(ax)
 

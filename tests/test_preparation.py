@@ -84,7 +84,7 @@ def examples() -> list:
     state = records.integrator(rng.normal(size=21), 1.5, rtol=1e-8, atol=np.ones(21))
     times = np.linspace(0.0, 1.0, 7)
     return [
-        workspace(3, 3), state, records.new_record(7, 3, 3), packing.examples()[0],
+        workspace(3, 3), state, records.new_record(7, 3, 3), packing.example_tuples()[0],
         records.Segment(2.5, True, 9, times, np.ones((7, 21)), np.ones(21)),
     ]  # fmt: skip
 
@@ -102,7 +102,7 @@ def as_words(x: Any) -> list[int]:
 def test_words_are_those_of_a_walk_through_the_tuple(k):
     """Compiled code finds the numbers, and the addresses and shapes of arrays, in the order of the fields."""
     x = examples()[k]
-    assert list(packing.pack_anew(x).words) == as_words(x)
+    assert list(packing.pack_uncached(x).words) == as_words(x)
 
 
 @pytest.mark.parametrize(
@@ -120,9 +120,9 @@ def test_arguments_of_other_types_are_refused(wrong):
     """Machine code gets nothing that it would misread."""
     native.library()
     segment = examples()[4]
-    packing.pack_anew(segment)
+    packing.pack_uncached(segment)
     with pytest.raises(TypeError):
-        packing.pack_anew(segment._replace(**wrong))
+        packing.pack_uncached(segment._replace(**wrong))
 
 
 def test_singular_values_come_when_they_are_asked_for(tmp_path):
@@ -257,10 +257,12 @@ def test_the_verdict_finds_what_was_altered_after_the_flight():
 def test_a_copy_of_what_is_packed_has_the_addresses_of_its_own_arrays():
     """A deep copy of a flight that has not been evaluated keeps nothing of the original."""
     times = np.linspace(0.0, 2.5, 7)
-    given = packing.pack_anew(records.Segment(2.5, True, 9, times, np.ones((7, 21)), np.ones(21)))
+    given = packing.pack_uncached(
+        records.Segment(2.5, True, 9, times, np.ones((7, 21)), np.ones(21))
+    )
     for other in (copy.deepcopy(given), pickle.loads(pickle.dumps(given))):
         assert other.of.times is not times
-        assert bytes(other.words) == bytes(packing.pack_anew(other.of).words)
+        assert bytes(other.words) == bytes(packing.pack_uncached(other.of).words)
     result = simulate(load_mission("square"))
     other = copy.deepcopy(result)
     np.testing.assert_array_equal(

@@ -10,7 +10,7 @@ from rigidfleet.cli.app import main
 from rigidfleet.errors import MissionError
 from rigidfleet.interchange import FORMATS
 from rigidfleet.mission import KINDS, Mission
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.preflight.check import check
 from rigidfleet.sweep import Sweep
 from rigidfleet.sweep.run import fly_runs
@@ -378,7 +378,7 @@ def test_free_velocity_of_a_smooth_way():
 def test_free_velocity_through_points():
     """Through a point, no other velocity has less snap: compared with 40 others by SciPy's polynomials."""
     through = [{"position": [4.0, 3.0, 11.0], "time": 2.5}]
-    leg = preview(mission(FREE | {"through": through}, smoothness="jerk"))[0][0].leg
+    leg = preview_phases(mission(FREE | {"through": through}, smoothness="jerk"))[0][0].leg
     knots, pieces = leg.motion.knots, leg.motion.coefficients[:, :3]
 
     def snap(c):
@@ -395,8 +395,8 @@ def test_free_velocity_through_points():
 
     x = np.array([[0.75, 0.75, 10.75], [4, 3, 11], FREE["position"]])
     rng = np.random.default_rng(1)
-    assert leg.after.goal is not None
-    v = leg.after.goal.v
+    assert leg.planned_end_state.goal is not None
+    v = leg.planned_end_state.goal.v
     for change in rng.normal(scale=0.1, size=(40, 3)):
         end = np.stack([v + change, np.zeros(3), np.zeros(3)])
         assert snap(splines.minimum_snap(knots, x, np.zeros((3, 3)), end)) > snap(pieces)

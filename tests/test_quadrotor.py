@@ -38,7 +38,9 @@ NO_AIR = {"rotor_drag": (0, 0), "lift": 0.0, "c": (0, 0, 0)}
 
 
 def derivative(vehicle: fleet.VehicleDynamics, S, command, wind) -> np.ndarray:
-    flight = fleet.ideal_flight(fleet.quadrotors([vehicle] * len(S), G), start=0.0, h=1e-3, steps=1)
+    flight = fleet.ideal_flight(
+        fleet.quadrotor_arrays([vehicle] * len(S), G), start=0.0, h=1e-3, steps=1
+    )
     return derivatives(flight, np.array(S), np.array(command), np.array(wind))
 
 
@@ -80,7 +82,7 @@ def test_a_second_of_random_rotor_inputs(name):
         flight = by_rotors(flight)
         for k, command in enumerate(given["command"]):
             flight.commands.speeds[0] = command
-            call = fleet.segment(1, 0, 0.02 * (k + 1))
+            call = fleet.sampled_segment(1, 0, 0.02 * (k + 1))
             assert sampled.fly_ticks(problem, work, flight, state, call) == FINISHED
         errors.append(np.abs(state.S[0] - given["end"])[:3].max())
     assert errors[1] < 1e-6
@@ -138,7 +140,10 @@ def test_many_derivatives_are_those_of_rotorpy(name):
 def test_hover(vehicle):
     """A vehicle that hovers stays where it is, its rotors carry a quarter of the weight each."""
     problem, work, flight, state = begun([vehicle], [[1.0, 2.0, 3.0]])
-    assert sampled.fly_ticks(problem, work, flight, state, fleet.segment(1, 0, 5.0)) == FINISHED
+    assert (
+        sampled.fly_ticks(problem, work, flight, state, fleet.sampled_segment(1, 0, 5.0))
+        == FINISHED
+    )
     np.testing.assert_allclose(state.S[0, :3], [1, 2, 3], rtol=0, atol=1e-11)
     np.testing.assert_allclose(state.peak, vehicle.m * G / 4, rtol=1e-12)
     assert not state.saturated.any()
@@ -157,7 +162,7 @@ def test_free_fall():
 
     before = momentum_and_energy()
     times = np.linspace(0.0, 2.0, 9)
-    call = fleet.segment(1, 0, 2.0, times)
+    call = fleet.sampled_segment(1, 0, 2.0, times)
     sampled.fly_ticks(problem, work, by_rotors(flight), state, call)
     t = times[:, None]
     path = np.array([0, 0, 100]) + t * [1, -2, 3] - 0.5 * G * t**2 * [0, 0, 1]
@@ -174,7 +179,7 @@ def test_motor_step():
     flight = by_rotors(flight)
     flight.commands.speeds[0] = 1.2 * w0, 0.8 * w0, 1.2 * w0, 0.8 * w0
     times = np.linspace(0.003, 0.1, 7)
-    call = fleet.segment(1, 0, 0.1, times)
+    call = fleet.sampled_segment(1, 0, 0.1, times)
     sampled.fly_ticks(problem, work, flight, state, call)
     up, down = 1.2 - 0.2 * np.exp(-times / 0.02), 0.8 + 0.2 * np.exp(-times / 0.05)
     np.testing.assert_allclose(call.S[:, 0, 13] / w0, up, rtol=0, atol=1e-7)
@@ -188,7 +193,7 @@ def test_quadratic_motor():
     w0, flight = state.S[0, 13], by_rotors(flight)
     c = 1.3 * w0
     flight.commands.speeds[:] = c
-    sampled.fly_ticks(problem, work, flight, state, fleet.segment(1, 0, 0.05))
+    sampled.fly_ticks(problem, work, flight, state, fleet.sampled_segment(1, 0, 0.05))
     expected = c * math.tanh(math.atanh(w0 / c) + b * c * 0.05)
     np.testing.assert_allclose(state.S[0, 13:], expected, rtol=1e-8)
 
@@ -208,7 +213,7 @@ def test_attitude_step():
     for _ in range(150):
         x = held[:3, :3] @ x + held[:3, 3] * (K @ x)
         expected.append(x[0])
-    call = fleet.segment(1, 0, 0.3, dt * np.arange(1, 151))
+    call = fleet.sampled_segment(1, 0, 0.3, dt * np.arange(1, 151))
     sampled.fly_ticks(problem, work, flight, state, call)
     roll = 2.0 * call.S[:, 0, 7]
     np.testing.assert_allclose(roll / angle, np.array(expected) / angle, rtol=0, atol=2e-5)
@@ -220,7 +225,7 @@ def test_momentum_of_the_rotors():
     vehicle = replace(
         HUMMINGBIRD, **NO_AIR, thrust=(0, 0, 1e-16), torque=(0, 0, 1e-18), rotor_inertia=2e-5, motor=(50, 0, 50, 0)
     )  # fmt: skip
-    vehicles = fleet.quadrotors([vehicle], G)._replace(g=0.0)
+    vehicles = fleet.quadrotor_arrays([vehicle], G)._replace(g=0.0)
     problem, work, flight, state = begun([HUMMINGBIRD], h=5e-4)
     flight = by_rotors(flight._replace(vehicles=vehicles))
     state.S[0, 10:13] = 3.0, -2.0, 1.0
@@ -232,7 +237,7 @@ def test_momentum_of_the_rotors():
         return T.T @ (np.array(vehicle.inertia) * state.S[0, 10:13] + own)
 
     before = momentum()
-    sampled.fly_ticks(problem, work, flight, state, fleet.segment(1, 0, 1.0))
+    sampled.fly_ticks(problem, work, flight, state, fleet.sampled_segment(1, 0, 1.0))
     np.testing.assert_allclose(momentum(), before, rtol=0, atol=1e-9)
     assert np.abs(state.S[0, 13:] - [900, 100, 700, 300]).max() < 1e-6
 
@@ -251,7 +256,7 @@ def test_wind_is_a_change_of_frame():
         if moving:
             flight = flight._replace(air=flight.air._replace(wind=wind))
             state.S[0, 3:6] = wind
-        sampled.fly_ticks(problem, work, flight, state, fleet.segment(1, 0, 1.0))
+        sampled.fly_ticks(problem, work, flight, state, fleet.sampled_segment(1, 0, 1.0))
         ends.append(state.S[0])
     ends[1][:6] -= np.concatenate([wind, wind])
     np.testing.assert_allclose(ends[1], ends[0], rtol=0, atol=1e-11)
@@ -266,7 +271,7 @@ def test_gusts_keep_the_order_of_the_steps():
         problem, work, flight, state = begun([dragged], h=h, steps=round(8e-3 / h))
         flight = by_rotors(flight._replace(air=flight.air._replace(gust=table, gust_step=0.04)))
         flight.commands.speeds[:] = state.S[0, 13]
-        sampled.fly_ticks(problem, work, flight, state, fleet.segment(1, 0, 0.56))
+        sampled.fly_ticks(problem, work, flight, state, fleet.sampled_segment(1, 0, 0.56))
         ends.append(state.S[0, :3])
     errors = [np.abs(end - ends[-1]).max() for end in ends[:-1]]
     assert errors[0] > 1e-10
@@ -279,7 +284,7 @@ def below(distance: float, aside: float) -> float:
     vehicle = replace(HUMMINGBIRD, radius=0.1)
     problem, work, flight, state = begun([vehicle] * 2, [[0, 0, 9.0], [aside, 0, 9.0 - distance]])
     flight = flight._replace(air=flight.air._replace(downwash=True))
-    call = fleet.segment(2, 0, 0.01, [0.0])
+    call = fleet.sampled_segment(2, 0, 0.01, [0.0])
     sampled.fly_ticks(problem, work, flight, state, call)
     assert call.air[0, 0].tolist() == [0, 0, 0]  # nothing from below
     return -float(call.air[0, 1, 2])
@@ -303,7 +308,7 @@ def test_downwash_pushes_the_lower_vehicle_down():
     vehicle = replace(HUMMINGBIRD, radius=0.1)
     problem, work, flight, state = begun([vehicle] * 2, [[0, 0, 9.0], [0, 0, 5.0]])
     flight = flight._replace(air=flight.air._replace(downwash=True))
-    call = fleet.segment(2, 0, 0.002, [0.0])
+    call = fleet.sampled_segment(2, 0, 0.002, [0.0])
     sampled.fly_ticks(problem, work, flight, state, call)
     alone = derivative(vehicle, call.S[0, 1:], call.command[0, 1:], [[0, 0, -below(4.0, 0.0)]])
     np.testing.assert_allclose(call.dS[0, 1], alone[0], rtol=0, atol=1e-12)
@@ -312,10 +317,10 @@ def test_downwash_pushes_the_lower_vehicle_down():
 
 def test_ground_effect():
     """The thrust near the ground is that of the published formula, also for one rotor alone, and fades with height."""
-    alone = aerodynamics.ground_effect(0.3, 0.2, np.array([1e6, 1e6]))
+    alone = aerodynamics.ground_effect_factor(0.3, 0.2, np.array([1e6, 1e6]))
     assert alone == pytest.approx(1.0 / (1.0 - (0.2 / (4 * 0.3)) ** 2), rel=1e-12)
     vehicle = replace(HUMMINGBIRD, radius=0.1)
-    span = fleet.quadrotors([vehicle]).span[0]
+    span = fleet.quadrotor_arrays([vehicle]).span[0]
     np.testing.assert_allclose(span, [0.34 * 0.70710678118, 0.34], rtol=1e-9)
     d, b, R, z = *span, 0.1, 0.2
     terms = z / np.sqrt((d**2 + 4 * z**2) ** 3) + 0.5 * z / np.sqrt((2 * d**2 + 4 * z**2) ** 3)
@@ -328,7 +333,7 @@ def test_ground_effect():
     assert a == pytest.approx(G * (ratio - 1.0), rel=1e-9)
     assert 1.05 < ratio < 1.3
     heights = [0.01, 0.05, 0.1, 0.3, 3.0]
-    gains = [aerodynamics.ground_effect(h, R, span) for h in heights]
+    gains = [aerodynamics.ground_effect_factor(h, R, span) for h in heights]
     assert gains[0] == gains[1]  # half a radius and below
     assert gains[1:] == sorted(gains[1:], reverse=True)
     assert gains[-1] == pytest.approx(1.0, abs=1e-3)
@@ -442,7 +447,7 @@ def test_allocation_keeps_its_priorities():
         PAPER, rotors=[[0.2, 0.15, 0], [0.15, -0.2, 0], [-0.2, -0.15, 0], [-0.15, 0.25, 0]]
     )
     for vehicle in (PAPER, uneven):
-        B = vehicle.allocation(G)
+        B = vehicle.allocation_matrix(G)
         for _ in range(100):
             thrust, tau = (
                 rng.uniform(-5, 30),
@@ -477,7 +482,7 @@ def test_thrust_and_attitude_can_be_commanded():
         kind=fleet.ATTITUDE, thrust=np.array([6.0]), attitude=q[None].copy()
     )
     flight = flight._replace(commands=commands)
-    call = fleet.segment(1, 0, 2.0, [2.0])
+    call = fleet.sampled_segment(1, 0, 2.0, [2.0])
     sampled.fly_ticks(problem, work, flight, state, call)
     assert attitude.angle_between(state.S[0, 6:10], q) < 1e-6
     expected = attitude.dcm_from_quaternion(q).T @ [0, 0, 12.0] - [0, 0, G]
@@ -488,6 +493,6 @@ def test_rotors_that_cannot_turn_or_lift_the_vehicle_are_refused():
     """Rotors at one place have no torque, and rotors beside the centre of mass cannot hover: errors say so."""
     aside = np.array([[0.3, 0.1, 0], [0.3, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0]])
     with pytest.raises(ValueError, match="cannot hover"):
-        fleet.quadrotors([replace(PAPER, rotors=aside)])
+        fleet.quadrotor_arrays([replace(PAPER, rotors=aside)])
     with pytest.raises(ValueError, match="do not span thrust and three torques"):
-        fleet.quadrotors([replace(PAPER, rotors=np.zeros((4, 3)))])
+        fleet.quadrotor_arrays([replace(PAPER, rotors=np.zeros((4, 3)))])

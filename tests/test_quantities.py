@@ -19,11 +19,11 @@ from rigidfleet.assessment import Verdict, safety
 from rigidfleet.cli import app as cli
 from rigidfleet.mission import Limits, json_schema
 from rigidfleet.preflight.findings import Preflight
-from rigidfleet.reporting import html_page
+from rigidfleet.reporting import report_page
 from rigidfleet.result import Result
 from rigidfleet.simulation.flight import simulate
 from rigidfleet.sweep import METRICS, Sweep, read
-from rigidfleet.sweep.metrics import measure
+from rigidfleet.sweep.metrics import measure_metrics
 from rigidfleet.sweep.record import RunRecord
 from rigidfleet.sweep.store import FILE, Store
 
@@ -117,7 +117,7 @@ def test_a_limit_that_a_flight_fails_by_is_in_all_readers(key, capsys):
         before.remarks
     )
     factor = 0.01 if q.unit == "%" else 1.0
-    assert measure(result, verdict)[name] == pytest.approx(factor * check.worst)
+    assert measure_metrics(result, verdict)[name] == pytest.approx(factor * check.worst)
     assert METRICS[name].text == q.text
     (row,) = [row for row in safety(result, verdict) if row.quantity == q.name_in_words]
     assert not row.passed
@@ -136,7 +136,7 @@ def test_a_limit_that_a_flight_fails_by_is_on_page_and_figure(key):
     name, _, _, figure = BROKEN[key]
     result, verdict, _ = flown(key)
     q = QUANTITIES[name]
-    page = html_page(result)
+    page = report_page(result)
     check = max((c for c in verdict.checks if c.check == name), key=lambda c: q.rank(c.worst))
     rows = re.findall(rf'<tr class="fails"><td class="words">{q.name_in_words}\b', page)
     assert len(rows) >= 2  # of the safety page and of all checks
@@ -219,7 +219,7 @@ def test_a_collision_with_a_lost_vehicle_is_judged_without_its_first_contact():
 def test_metrics_of_a_calm_flight_are_those_of_its_checks():
     """What has no limit is a metric, too: the greatest speed of a flight is the one of its samples, or more."""
     result = simulate(rf.Mission.from_dict(POINTS))
-    values = measure(result, rf.assess(result))
+    values = measure_metrics(result, rf.assess(result))
     assert values["speed"] >= np.linalg.norm(result.velocity, axis=2).max()
     assert math.isnan(values["jerk"])
     assert set(values) == set(METRICS)
@@ -237,14 +237,14 @@ def test_a_store_of_an_earlier_version_is_read_and_goes_on(tmp_path):
         for k in (0, 1)
     ]
     with Store(tmp_path, sweep, "", replace=False) as store:
-        store.add(rows[:1])
+        store.add_records(rows[:1])
     with closing(sqlite3.connect(tmp_path / FILE)) as db:
         db.execute("ALTER TABLE runs DROP COLUMN vertical_jerk")
     table = read(tmp_path)
     assert np.isnan(table.metrics["vertical_jerk"]).tolist() == [True]
     assert table.metrics["speed"].tolist() == [1.0]
     with Store(tmp_path, sweep, "", replace=False) as store:
-        store.add(rows[1:])
+        store.add_records(rows[1:])
     table = read(tmp_path)
     np.testing.assert_array_equal(table.metrics["vertical_jerk"], [np.nan, 2.0])
     assert table.metrics["steps"].tolist() == [1.0, 2.0]

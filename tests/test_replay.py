@@ -18,9 +18,9 @@ from rigidfleet.mission import Mission, load_mission
 from rigidfleet.plotting import agent_colours, figure_names
 from rigidfleet.simulation.as_logged import Doubts, judge_log
 from rigidfleet.simulation.flight import simulate
-from rigidfleet.web.replay import html_page, replay
-from rigidfleet.web.replay.pack import PackedColumn, pack
-from rigidfleet.web.replay.page import bundle, page_text
+from rigidfleet.web.replay import replay, replay_page
+from rigidfleet.web.replay.pack import PackedColumn, pack_columns
+from rigidfleet.web.replay.page import bundle_module, page_text
 from rigidfleet.web.replay.scene import thrust_directions
 
 EIGHT = swarm(8, 90.0)
@@ -61,7 +61,7 @@ def test_packed_values_return():
     values = rng.normal(scale=50.0, size=(40, 3, 2))
     values[10:20, 1] = np.nan
     values[5, 0, 0] = np.inf
-    described, text = pack(
+    described, text = pack_columns(
         {"a": PackedColumn(values, 0.01), "b": PackedColumn(values[:, 0, 1], 0.5)}
     )
     assert [(c["name"], c["width"]) for c in described] == [("a", 6), ("b", 1)]
@@ -78,7 +78,7 @@ def test_packed_values_return():
 
 def test_alone():
     """Nothing in the page comes from elsewhere, and its policy allows nothing else."""
-    page = html_page(EIGHT)
+    page = replay_page(EIGHT)
     assert re.findall(r"https?://|//cdn|@import|\bsrc\s*=|\bimport\s*\(", page) == []
     assert "content=\"default-src 'none';" in page
     assert not re.search(r"\{\{ *(policy|title|style|info|data|script)\b", page)
@@ -87,7 +87,7 @@ def test_alone():
 @pytest.mark.parametrize("start", ["replay/replay.js", "live/live.js"])
 def test_modules_become_one(start):
     """Each module stands once, after those that it imports, and none asks for another any more."""
-    text = bundle(start)
+    text = bundle_module(start)
     assert re.findall(r"^(?:import|export)\b.*", text, re.M) == []
     places = [text.index(line) for line in ("class Renderer", "class Scene", "class Player {")]
     assert places == sorted(places)
@@ -116,30 +116,30 @@ def test_modules_import_what_there_is():
 
 def test_users_words_stay_words():
     """A name that looks like mark-up does not end the script it stands in."""
-    page = html_page(EIGHT)
+    page = replay_page(EIGHT)
     assert page.count("</script>") == 3
     assert parts(page)[0]["phases"][1]["name"] == '<round> & "round"</script>'
 
 
 def test_same_flight_same_page():
     """The same flight makes the same page, byte for byte."""
-    assert html_page(EIGHT) == html_page(swarm(8, 90.0))
+    assert replay_page(EIGHT) == replay_page(swarm(8, 90.0))
 
 
 @pytest.mark.parametrize(("n", "seconds", "megabytes"), [(8, 90.0, 0.3), (200, 60.0, 1.5)])
 def test_small(n, seconds, megabytes):
     """90 s of eight vehicles take less than 0.3 MB, 60 s of 200 less than 1.5 MB."""
-    assert len(html_page(swarm(n, seconds))) < megabytes * 1e6
+    assert len(replay_page(swarm(n, seconds))) < megabytes * 1e6
 
 
 def test_colours_of_the_figures():
     """Vehicles have the colours of the figures."""
-    assert parts(html_page(EIGHT))[0]["colours"] == agent_colours(8)
+    assert parts(replay_page(EIGHT))[0]["colours"] == agent_colours(8)
 
 
 def test_columns_are_the_flight():
     """Position, slot, attitude and tension at the page's even times are those of the result."""
-    info, columns = parts(html_page(EIGHT))
+    info, columns = parts(replay_page(EIGHT))
     t = info["start"] + info["step"] * np.arange(info["count"])
     assert t[0] == EIGHT.time[0]
     assert t[-1] == pytest.approx(EIGHT.time[-1])
@@ -166,7 +166,7 @@ def test_columns_are_the_flight():
 def test_columns_of_quadrotors():
     """Vehicles have their own attitude, without jumps of sign, and each rotor its share of the limit."""
     result = quadrotors(3, 40.0)
-    info, columns = parts(html_page(result))
+    info, columns = parts(replay_page(result))
     assert info["rotors"] == [True] * 3
     assert "thrust" not in columns
     q = columns["turn"].reshape(-1, 3, 4)
@@ -188,7 +188,7 @@ def test_points_among_quadrotors_lean_into_their_thrust():
     data = result.mission.to_dict()
     data["vehicles"]["point"] = {"model": "point", "mass": 1.0}
     data["agents"]["vehicle"] = ["quadrotor", "point", "quadrotor"]
-    info, columns = parts(html_page(replace(result, mission_text=Mission.from_dict(data).text)))
+    info, columns = parts(replay_page(replace(result, mission_text=Mission.from_dict(data).text)))
     assert info["rotors"] == [True, False, True]
     assert {"turn", "thrust"} <= set(columns)
     assert columns["rotors"].reshape(-1, 3, 4)[50, 1].tolist() == [0.0] * 4
@@ -201,7 +201,7 @@ def test_jumps_stay_where_they_are():
     second = result.phase == 1
     result.slot_position[second] += [0.0, 0.0, 2.0]
     result.slot_position[~second, 0] = np.nan
-    info, columns = parts(html_page(result))
+    info, columns = parts(replay_page(result))
     t = info["start"] + info["step"] * np.arange(info["count"])
     rise = (columns["position"] + columns["slot"]).reshape(-1, 4, 3)[:, 1, 2] - 12.0
     np.testing.assert_allclose(rise[t < 5.0 - 1e-9], 0.0, atol=2e-3)
@@ -221,8 +221,8 @@ def test_samples_no_denser_than_seen():
         if isinstance(value, np.ndarray) and len(value) == len(dense.time):
             resampled[name] = value[np.searchsorted(dense.time, fine).clip(0, len(dense.time) - 1)]
     resampled["time"] = fine
-    assert parts(html_page(swarm(2, 4.0, **resampled)))[0]["step"] == pytest.approx(1 / 30)
-    assert parts(html_page(dense))[0]["step"] == pytest.approx(0.05)
+    assert parts(replay_page(swarm(2, 4.0, **resampled)))[0]["step"] == pytest.approx(1 / 30)
+    assert parts(replay_page(dense))[0]["step"] == pytest.approx(0.05)
 
 
 # -- choices
@@ -245,7 +245,7 @@ def test_tension_scale(share, tension, beyond):
     """Full colour stands for the greatest tension, but for no less than 0.5 % and no more than twice the weight."""
     multiplier = np.zeros_like(EIGHT.multiplier)
     multiplier[7, 3] = -share * 9.81
-    info, _ = parts(html_page(swarm(8, 90.0, multiplier=multiplier)))
+    info, _ = parts(replay_page(swarm(8, 90.0, multiplier=multiplier)))
     assert info["tension"] == pytest.approx(tension)
     assert info["beyond"] is beyond
     assert ("No edge carries a force above" in info["note"]) is (share < 0.005)
@@ -254,7 +254,7 @@ def test_tension_scale(share, tension, beyond):
 def test_too_many_edges(monkeypatch):
     """Of too many edges the shortest are drawn, and the page says so."""
     monkeypatch.setattr(import_module("rigidfleet.web.replay"), "_EDGES", 10)
-    info, columns = parts(html_page(EIGHT))
+    info, columns = parts(replay_page(EIGHT))
     assert len(info["edges"]) == columns["tension"].shape[1] == 10
     assert "10 shortest of 17 edges" in info["note"]
     straight = {
@@ -274,7 +274,7 @@ def test_nothing_known():
     for name in ("slot_position", "attitude", "attitude_reference", "cm_reference"):
         first[name] = np.full_like(first[name], np.nan)
     first["separation"] = np.array([np.inf])
-    info, columns = parts(html_page(swarm(1, 10.0, **first, phases=one.phases[:1])))
+    info, columns = parts(replay_page(swarm(1, 10.0, **first, phases=one.phases[:1])))
     assert info["count"] == 1
     assert info["step"] == 0.0
     assert np.isnan(columns["slot"]).all()
@@ -284,7 +284,7 @@ def test_nothing_known():
 def test_incomplete():
     """A flight that stopped says why."""
     assert (
-        parts(html_page(swarm(2, 4.0, complete=False, ending="too steep")))[0]["ending"]
+        parts(replay_page(swarm(2, 4.0, complete=False, ending="too steep")))[0]["ending"]
         == "too steep"
     )
 
@@ -294,7 +294,7 @@ def test_incomplete():
 
 def test_fences_people_and_falls_are_on_the_page():
     """The page has rings and heights; without drag, vehicles fall by the parabola. Other pages have none of it."""
-    info, columns = parts(html_page(fenced(EIGHT)))
+    info, columns = parts(replay_page(fenced(EIGHT)))
     kinds = {area["name"]: (area["kind"], area["hatched"]) for area in info["areas"]}
     expected = {"tent": ("fence", True), "field": ("soft", False), "crowd": ("people", True)}
     assert kinds == expected
@@ -307,21 +307,21 @@ def test_fences_people_and_falls_are_on_the_page():
     time = info["start"] + info["step"] * np.arange(info["count"])
     k = np.abs(EIGHT.time - time[400]).argmin()
     np.testing.assert_allclose(columns["fall"][400].reshape(-1, 2), lands[k], atol=0.05)
-    plain, none = parts(html_page(EIGHT))
+    plain, none = parts(replay_page(EIGHT))
     assert plain["areas"] == []
     assert not {"fall", "doubt"} & {*none}
 
 
 def test_the_overview_shows_people_near_the_flight():
     """A crowd that is beside the flight is in sight, and not what is kilometres away."""
-    sight = np.array(parts(html_page(fenced(EIGHT)))[0]["sight"])
+    sight = np.array(parts(replay_page(fenced(EIGHT)))[0]["sight"])
     assert sight[:, 0].max() >= 40.0
     assert np.abs(sight).max() < 500.0
 
 
 def test_drifts_of_a_log_are_on_the_page():
     """Who is off its slot from when to when, what is in doubt and what is surely off are on a log's page; no thrust."""
-    info, columns = parts(html_page(drifting(4, 2, 20.0, 30.0, 1.5, 0.2)))
+    info, columns = parts(replay_page(drifting(4, 2, 20.0, 30.0, 1.5, 0.2)))
     (drift,) = info["drifts"]
     assert drift["who"] == 2
     assert [drift["start"], drift["end"]] == pytest.approx([20.0, 30.0], abs=0.051)
@@ -332,7 +332,7 @@ def test_drifts_of_a_log_are_on_the_page():
     np.testing.assert_allclose(columns["off plot"][k], [1.5, 1.3, 1.7], atol=1e-3)
     assert np.isfinite(columns["tension"]).all()  # edges are drawn, without a force
     assert not info["forces"]
-    hidden = parts(html_page(drifting(4, 2, 20.0, 30.0, 0.1, 0.2)))[0]
+    hidden = parts(replay_page(drifting(4, 2, 20.0, 30.0, 0.1, 0.2)))[0]
     assert hidden["drifts"] == []  # it may be in its slot
 
 
@@ -348,7 +348,7 @@ def test_a_log_that_is_judged_has_its_plan_on_the_page():
     places[1][:, 2] += bump
     noise = 0.003 * np.random.default_rng(0).standard_normal((2, len(t), 3))
     result, _ = judge_log(logged([t, t], [*(places + noise)]), plan, Doubts(0.003, 0.0))
-    info = parts(html_page(result))[0]
+    info = parts(replay_page(result))[0]
     assert {drift["who"] for drift in info["drifts"]} == {1}
     longest = max(info["drifts"], key=lambda drift: drift["end"] - drift["start"])
     # Without a limit, unusual is twice the median of what vehicles are off on average: here, of one of the two.
@@ -362,14 +362,14 @@ def test_a_log_of_vehicles_with_rotors_shows_nothing_of_rotors():
     """A log says where vehicles are: neither attitudes nor rotors of its plan are shown as if measured."""
     plan = quadrotors(3, 10.0)
     shown = {"turn", "rotors", "saturated", "rotor plot"}
-    info, columns = parts(html_page(plan))
+    info, columns = parts(replay_page(plan))
     assert shown <= {*columns}
     assert "rotors" in info
     random = np.random.default_rng(0)
     places = plan.position + 0.003 * random.standard_normal(plan.position.shape)
     log = logged([plan.time] * 3, [*places.swapaxes(0, 1)])
     result, _ = judge_log(log, plan, Doubts(0.003, 0.0))
-    info, columns = parts(html_page(result))
+    info, columns = parts(replay_page(result))
     assert not shown & {*columns}
     assert "rotors" not in info
     assert {"off plot", "doubt"} <= {*columns}
@@ -392,7 +392,7 @@ def test_file(tmp_path):
     path = tmp_path / "flight.html"
     path.write_text("old")
     replay(EIGHT, path)
-    assert path.read_text(encoding="utf-8") == html_page(EIGHT)
+    assert path.read_text(encoding="utf-8") == replay_page(EIGHT)
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -405,7 +405,7 @@ def test_no_such_folder(tmp_path):
 def test_thrust_of_many_is_its_least_and_greatest():
     """Of twelve vehicles each has a line of thrust; of more, the plot has the least and the greatest of all."""
     few, many = swarm(12, 3.0), swarm(13, 3.0)
-    assert parts(html_page(few))[1]["thrust plot"].shape[1] == 12
-    column = parts(html_page(many))[1]["thrust plot"]
+    assert parts(replay_page(few))[1]["thrust plot"].shape[1] == 12
+    column = parts(replay_page(many))[1]["thrust plot"]
     ends = np.sort(many.thrust[0])[[0, -1]]
     np.testing.assert_allclose(column[0], ends, atol=1e-3)

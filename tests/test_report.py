@@ -19,8 +19,8 @@ from rigidfleet.assessment.verdict import Extreme
 from rigidfleet.cli.app import main
 from rigidfleet.errors import ResultError
 from rigidfleet.mission import Mission
-from rigidfleet.reporting import gains, html_page, report
-from rigidfleet.reporting.contents import contents
+from rigidfleet.reporting import gains, report, report_page
+from rigidfleet.reporting.contents import page_contents
 from rigidfleet.result import Result
 from rigidfleet.simulation.flight import simulate
 from rigidfleet.sweep.store import read as load
@@ -127,8 +127,8 @@ def test_page_is_whole(calm, tmp_path):
 
 def test_verdict_comes_first(calm, hasty, quick):
     """The verdict stands before all else, in words that are those of the verdict."""
-    assert "Passed" in Page(html_page(calm)).text.split("Safety")[0]
-    first = Page(html_page(hasty)).text.split("Safety")[0]
+    assert "Passed" in Page(report_page(calm)).text.split("Safety")[0]
+    first = Page(report_page(hasty)).text.split("Safety")[0]
     assert "Failed" in first
     failed = [f.message for f in assess(hasty).checks if not f.passed]
     assert len(failed) == 2
@@ -137,8 +137,8 @@ def test_verdict_comes_first(calm, hasty, quick):
 
 def test_words_of_users_are_words(calm, quick):
     """What a user writes into a title stays text, whatever it looks like."""
-    assert "<b>climb" not in html_page(calm)
-    assert "Three <b>climb</b> & turn" in Page(html_page(calm)).text
+    assert "<b>climb" not in report_page(calm)
+    assert "Three <b>climb</b> & turn" in Page(report_page(calm)).text
 
 
 def test_safety(calm):
@@ -191,18 +191,18 @@ def test_vehicles_with_rotors(calm, quick):
     assert worst(rows["rotor force"]).who == "agent 2"
     assert rows["rotor force"].used == pytest.approx(1.0)
     assert worst(rows["tilt"]).value == pytest.approx(20.0)
-    text = Page(html_page(result)).text
+    text = Page(report_page(result)).text
     assert "3 × px4-sih" in text
     assert "share of rotor limit" in text
-    both = Page(html_page([calm, result])).text
+    both = Page(report_page([calm, result])).text
     assert "flown by points" in both
     assert "force of the rotor that comes nearest to its limit" in both
-    assert "rotor" not in Page(html_page(calm)).text
+    assert "rotor" not in Page(report_page(calm)).text
 
 
 def test_side_by_side(calm, hasty, quick):
     """Of several flights the page tells what differs: numbers, keys of the missions, overlaid figures."""
-    page = contents([calm, hasty], ["calm", "hasty"], None)
+    page = page_contents([calm, hasty], ["calm", "hasty"], None)
     assert {row.cells[0] for row in page["keys"].rows} == {
         "constraint.alpha", "constraint.beta", "constraint.gamma", "limits.geofence.max",
         "limits.speed", "phases[2].duration",
@@ -213,14 +213,14 @@ def test_side_by_side(calm, hasty, quick):
     one, other = numbers["least distance between two vehicles' surfaces [m]"]
     assert one == other
     assert len(page["overlays"]) == 2
-    text = Page(html_page([calm, hasty], labels=["calm", "hasty"])).text
+    text = Page(report_page([calm, hasty], labels=["calm", "hasty"])).text
     for words in ("2 flights side by side", "Differences", "calm", "hasty", "Passed", "Failed"):
         assert words in text
 
 
 def test_flights_of_one_mission_are_numbered(calm, quick):
     """Two flights of one mission are told apart, and their missions found to be the same."""
-    page = contents([calm, calm], None, None)
+    page = page_contents([calm, calm], None, None)
     assert [flight["label"] for flight in page["flights"]] == ["pair (1)", "pair (2)"]
     assert page["keys"].rows == []
     assert all(one == other for _, one, other in (row.cells for row in page["numbers"].rows))
@@ -292,7 +292,7 @@ name = "many"
 agents = {{mass = {[1 + 0.01 * i for i in range(n)]}, position = {[[3 * i, 0, 1] for i in range(n)]}}}
 phases = [{{kind = "hold", duration = 1}}]
 """
-    page = contents([simulate(Mission.from_toml(text))], None, None)
+    page = page_contents([simulate(Mission.from_toml(text))], None, None)
     (flight,) = page["flights"]
     shown = [row.cells[0].text for row in flight["vehicles"].rows]
     assert shown == [str(i) for i in range(17, 41)]
@@ -302,9 +302,9 @@ phases = [{{kind = "hold", duration = 1}}]
 def test_what_cannot_be_reported(calm, tmp_path, quick):
     """No flight, labels that do not fit, and a folder that is not there are errors that say so."""
     with pytest.raises(ValueError, match="needs a result"):
-        html_page([])
+        report_page([])
     with pytest.raises(ValueError, match="as many labels"):
-        html_page([calm], labels=["a", "b"])
+        report_page([calm], labels=["a", "b"])
     with pytest.raises(ResultError, match="no folder"):
         report(calm, tmp_path / "none" / "report.html")
 

@@ -14,7 +14,7 @@ from rigidfleet.assessment import assess
 from rigidfleet.errors import MissionError
 from rigidfleet.formation import assignment, shapes
 from rigidfleet.mission import Mission, mission_text
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.preflight.check import check
 from rigidfleet.simulation.flight import simulate
 
@@ -94,7 +94,7 @@ def least_and_promised(
 
 def planned_paths(seed: int) -> list[tuple[float, float]]:
     mission = random_reshape(seed)
-    return least_and_promised(mission, [planned.position for planned in preview(mission)[0]])
+    return least_and_promised(mission, [planned.position for planned in preview_phases(mission)[0]])
 
 
 def flown_paths(seed: int) -> list[tuple[float, float]]:
@@ -140,7 +140,7 @@ def test_the_first_establishment_keeps_its_room(assignment, attitude):
             data["phases"][0]["roll_deg"] = 70.0 * seed
         del data["formations"]["two"]
         mission = Mission.from_dict(data)
-        planned_phases = [planned.position for planned in preview(mission)[0]]
+        planned_phases = [planned.position for planned in preview_phases(mission)[0]]
         ((least, promised),) = least_and_promised(mission, planned_phases)
         assert least >= promised * (1 - 1e-12), seed
 
@@ -153,7 +153,7 @@ def test_ways_are_straight_and_shortest_where_the_attitude_is_known():
     phases = [establish("a", roll_deg=20.0, pitch_deg=-35.0, yaw_deg=110.0)]
     for rule in ("shortest", "each"):
         mission = fly({"a": slots}, start, phases, assignment=rule)
-        position = preview(mission)[0][0].position
+        position = preview_phases(mission)[0][0].position
         paths = position[-1] - position[0]
         there = about_centre(slots) @ turned.T
         least = min(
@@ -176,7 +176,7 @@ def test_slots_are_assigned_for_the_masses_that_are_flown():
         mission = fly(
             {"a": slots}, start, [establish("a")], assignment="each", agents={"mass": masses}
         )
-        path_ends = preview(mission)[0][0].path_ends
+        path_ends = preview_phases(mission)[0][0].path_ends
         assert path_ends is not None
         x, y = (np.asarray(p)[:, None] - np.asarray(p) for p in path_ends)
         assert (np.sum(x * y, axis=2) >= -1e-12).all()
@@ -188,7 +188,7 @@ def test_the_way_back_keeps_its_room():
     a, b = scattered(rng, 20), scattered(rng, 20)
     phases = [establish("a"), reshape("b"), reshape("a", name="again")]
     mission = fly({"a": a, "b": b}, a, phases, assignment="each", agents={"radius": 0.0})
-    planned_phases = preview(mission)[0]
+    planned_phases = preview_phases(mission)[0]
     promised = min(pdist(a).min(), pdist(b).min()) / np.sqrt(2)
     assert (
         min(pdist(p).min() for planned in planned_phases[1:] for p in planned.position) >= promised
@@ -306,7 +306,7 @@ def test_ways_nearer_than_the_limit_are_found():
         {"a": square, "b": turned}, start, phases, assignment="each", limits={"separation": 1.4}
     )
     texts = collisions(mission)
-    path_ends = preview(mission)[0][1].path_ends
+    path_ends = preview_phases(mission)[0][1].path_ends
     assert path_ends is not None
     s = np.linspace(0, 1, 2001)[:, None, None]
     separation = min(pdist(p).min() for p in (1 - s) * path_ends[0] + s * path_ends[1]) - 0.2
@@ -326,7 +326,7 @@ def test_a_formation_flown_again_from_elsewhere():
     )
     assert not any("'again'" in text for text in collisions(mission))
     assert mission.phases[3].leads_to == "a (2)"
-    planned = preview(mission)[0][3]
+    planned = preview_phases(mission)[0][3]
     assert min(pdist(p).min() for p in planned.position) >= min(
         pdist(a).min(), pdist(c).min()
     ) / np.sqrt(2)
@@ -410,7 +410,7 @@ def test_a_formation_is_established_as_it_is_drawn(keys, before, turned, formula
 
 
 def planned_end_is_flown(mission: Mission, result: Any) -> bool:
-    planned_phases, known = preview(mission)
+    planned_phases, known = preview_phases(mission)
     end = about_centre(planned_phases[-1].position[-1])
     return known and bool(np.abs(end - about_centre(result.position[-1])).max() < 1e-3)
 

@@ -95,7 +95,7 @@ def checked() -> tuple[list[list[tuple[str, str, str]]], set[Place]]:
         patch.setattr(findings.FindingCollector, "add", noted_add)
         for case in CASES:
             with pytest.raises(MissionError) as error:
-                check.checked_parts(case.mission, "a mission")
+                check.check_parts(case.mission, "a mission")
             results.append([(f.key, f.problem, f.remedy) for f in error.value.findings])
     return results, lines
 

@@ -31,7 +31,7 @@ def fly(
 ) -> fleet.SampledSegment:
     """Fly to the end and return the samples."""
     state.count[fleet.SAMPLES] = 0
-    call = fleet.segment(len(state.S), len(work.c), t_end, times, **given)
+    call = fleet.sampled_segment(len(state.S), len(work.c), t_end, times, **given)
     assert sampled.fly_ticks(problem, work, flight, state, call) == FINISHED
     return call
 
@@ -85,7 +85,7 @@ def test_a_pause_changes_no_bit():
     whole = fly(*given, t0 + 0.5, times)
     problem, work, flight, state = everything(rows=7)
     call, rng, trails, pauses = (
-        fleet.segment(8, len(work.c), t0 + 0.5, times),
+        fleet.sampled_segment(8, len(work.c), t0 + 0.5, times),
         np.random.default_rng(1),
         [],
         0,
@@ -344,7 +344,7 @@ def test_the_body_law_and_its_frame():
     native.Integration(plan.problem, work, state, 12.0, *unsampled)(True, 1 << 30)
     apart, turned = [], []
     for h in (8e-3, 4e-3, 2e-3):
-        fleet_ = fleet.quadrotors([POINT] * 3, G)
+        fleet_ = fleet.quadrotor_arrays([POINT] * 3, G)
         flight = fleet.ideal_flight(fleet_, start=6.0, h=h, steps=1)
         S = fleet.hover_states(fleet_, now.r, now.v)
         q = attitude.quaternion_from_dcm(plan.frame)
@@ -379,7 +379,7 @@ def test_a_singular_law_ends_the_flight():
     """A law without a solution gives no force: the flight stops there, and its state stays finite."""
     problem, work, flight, state = planned("cube-passage", 1, SIH)
     bad = problem.law._replace(alpha=np.nan)
-    call = fleet.segment(len(state.S), len(work.c), flight.start + 1.0)
+    call = fleet.sampled_segment(len(state.S), len(work.c), flight.start + 1.0)
     before = state.S.copy()
     assert sampled.fly_ticks(problem._replace(law=bad), work, flight, state, call) == COLLAPSED
     assert state.clock[0] == flight.start
@@ -391,7 +391,7 @@ def test_a_problem_with_disturbances_is_refused():
     problem, work, flight, state = begun([PAPER])
     disturbed = problem._replace(disturbance=problem.disturbance._replace(active=True))
     with pytest.raises(ValueError, match="without disturbances"):
-        sampled.fly_ticks(disturbed, work, flight, state, fleet.segment(1, 0, 1.0))
+        sampled.fly_ticks(disturbed, work, flight, state, fleet.sampled_segment(1, 0, 1.0))
 
 
 LIBRARIES = """
@@ -421,11 +421,11 @@ def test_code_that_cannot_be_kept_is_given_to_child_processes(monkeypatch):
     code = native._read_cached_code("sampled")
     assert code is not None
     others = {part: x for part, x in native._loaded.items() if part != "sampled"}
-    made = native._link("sampled", *native._link_objects(code), code)
+    made = native._make_library("sampled", *native._link_objects(code), code)
     monkeypatch.setattr(native, "_loaded", others | {"sampled": made})
     given = native.code_to_inherit()
     monkeypatch.setattr(native, "_loaded", others)
-    native.inherit(given)
+    native.inherit_code(given)
     assert native.library("sampled").unkept == code
 
 
@@ -437,7 +437,9 @@ def test_a_flight_goes_on_under_another_problem():
     m = len(wide.c)
     assert m != len(work.c)
     with pytest.raises(ValueError, match=r"fleet\.state_under_problem"):
-        sampled.fly_ticks(other, wide, flight, state, fleet.segment(8, m, flight.start + 0.2))
+        sampled.fly_ticks(
+            other, wide, flight, state, fleet.sampled_segment(8, m, flight.start + 0.2)
+        )
     state = fleet.state_under_problem(state, wide, np.full(m, 0.01))
     fly(other, wide, flight, state, flight.start + 0.2)
     assert state.count[fleet.TICKS] == 100
@@ -451,7 +453,11 @@ def test_tables_that_end_too_early_are_refused():
         tables = flight.tables._replace(last=10, jerk=np.zeros((rows, n, 3)))
         with pytest.raises(ValueError, match=r"the table 'jerk'.*needs 10 rows"):
             sampled.fly_ticks(
-                problem, work, flight._replace(tables=tables), state, fleet.segment(1, 0, 1.0)
+                problem,
+                work,
+                flight._replace(tables=tables),
+                state,
+                fleet.sampled_segment(1, 0, 1.0),
             )
 
 
@@ -495,7 +501,7 @@ def flown_by_us(vehicle: fleet.VehicleDynamics, t: np.ndarray, *wanted: np.ndarr
         problem.control.force[:] = se3_force(
             vehicle.m, state.S[:, :3], state.S[:, 3:6], *(x[k] for x in wanted)
         )
-        sampled.fly_ticks(problem, work, flight, state, fleet.segment(n, 0, 0.01 * (k + 1)))
+        sampled.fly_ticks(problem, work, flight, state, fleet.sampled_segment(n, 0, 0.01 * (k + 1)))
     return flown
 
 

@@ -21,7 +21,7 @@ from rigidfleet.mission.draft import draft
 from rigidfleet.planning import derivatives as d
 from rigidfleet.planning.legs import Leg, leg_of
 from rigidfleet.planning.limits import limits_of, use_of_limits
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.timing import broken_limits, complete_times
 from rigidfleet.preflight.check import check
 from rigidfleet.result import Result
@@ -117,7 +117,7 @@ def test_rotations_of_any_angle(size):
     """The series of Exp(phi) is SciPy's rotation a little later, from no turn to a hundred."""
     phi = random(5, 5, 3) * 0.3
     phi[0] *= size / np.linalg.norm(phi[0])
-    R = series.rotation(phi)
+    R = series.rotation_series(phi)
     for h in (0.0, 0.01):
         later = Rotation.from_rotvec(sum(x * h**k for k, x in enumerate(phi))).as_matrix()
         sum_ = sum(x * h**k for k, x in enumerate(R))
@@ -127,9 +127,9 @@ def test_rotations_of_any_angle(size):
 def test_rotation_vectors_invert_rotations():
     """Rotation vectors, their rotations and body rates are series of one another."""
     phi = random(6, 5, 3) * 0.5
-    R = series.rotation(phi)
-    np.testing.assert_allclose(series.rotation_vector(R), phi, rtol=0, atol=1e-12)
-    again = series.from_rates(R[0], series.body_rates(R))
+    R = series.rotation_series(phi)
+    np.testing.assert_allclose(series.rotation_vector_series(R), phi, rtol=0, atol=1e-12)
+    again = series.rotation_series_from_rates(R[0], series.body_rates_series(R))
     np.testing.assert_allclose(again, R, rtol=0, atol=1e-12)
 
 
@@ -395,7 +395,7 @@ def limited(*phases: dict, **more) -> Mission:
 def test_limits_are_found_between_samples():
     """What each leg reaches of each limit is that of 20,001 samples, to 1e-3, with its agent and time."""
     mission = limited(*WAYS)
-    for planned in preview(mission)[0]:
+    for planned in preview_phases(mission)[0]:
         leg = planned.leg
         expected = dense(leg, mission)
         for x in use_of_limits(limits_of(mission), leg.reference, leg.motion, leg.start, leg.end):
@@ -480,7 +480,7 @@ def test_automatic_times_keep_the_limits_and_no_shorter_ones_do():
             if phase.kind == "turn"
             else "duration"
         )
-        now = preview(resolved, k)[0][-1].leg.after
+        now = preview_phases(resolved, k)[0][-1].leg.planned_end_state
         fast = {key: 0.95 * getattr(phase, key)}
         if phase.kind == "fly" and phase.through:
             fast["through"] = tuple(

@@ -16,7 +16,7 @@ from rigidfleet.plotting import plot, space
 from rigidfleet.preflight.check import check
 from rigidfleet.result import Result
 from rigidfleet.solids import distance, records
-from rigidfleet.solids.outline import outline
+from rigidfleet.solids.outline import outline_of_solid
 from rigidfleet.web.replay import scene
 
 RNG = np.random.default_rng(5)
@@ -122,7 +122,7 @@ def test_a_height_map_is_as_far_as_the_nearest_of_its_prisms():
 def test_a_normal_is_the_gradient_and_leads_to_the_surface(name):
     """Against differences of the distance; a step against it, of the distance, ends on the surface."""
     s = records.one_solid(FORMS[name])
-    r = np.array(distance.own_axes(*WHERE, 0, s))
+    r = np.array(distance.in_own_axes(*WHERE, 0, s))
     d = np.asarray(distance.signed_distance(*r, 0, s))
     n = np.array(distance.outward_normal(*r, 0, s))
     steps = 1e-6 * np.eye(3)[:, :, None]
@@ -175,7 +175,7 @@ def test_the_kernel_compiles_the_same_distances():
     """Numbers, compiled, against arrays: the same source gives the same values, of every kind and while it moves."""
     from rigidfleet.kernel import obstacles
 
-    s = records.join(
+    s = records.join_solids(
         [records.one_solid(f, [1.0, 3.0], [[0, 0, 0], [1, 2, 3]]) for f in FORMS.values()]
     )
     where = WHERE[:, :60]
@@ -191,7 +191,7 @@ def test_a_solid_is_where_its_waypoints_say():
     """Straight between waypoints, at rest before the first and after the last."""
     times, ways = np.array([1.0, 2.0, 5.0]), RNG.normal(size=(3, 3))
     s, t = records.one_solid(FORMS["box"], times, ways), np.linspace(0, 6, 61)
-    found = np.array(distance.displacement(t, 0, s))
+    found = np.array(distance.solid_displacement(t, 0, s))
     expected = [np.interp(t, times, ways[:, q]) for q in range(3)]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
 
@@ -201,9 +201,9 @@ def test_an_outline_lies_on_the_surface_within_the_extent(name):
     """What is drawn has distance 0, but for chords of round things and sides of terrain, and fits what is measured."""
     form = FORMS[name]
     s = records.one_solid(form)
-    drawn = outline(s)
+    drawn = outline_of_solid(s)
     points = np.concatenate([drawn.triangles.reshape(-1, 3), drawn.lines.reshape(-1, 3)])
-    low, high = records.extent(s)
+    low, high = records.swept_extent(s)
     assert ((points >= low - 1e-9) & (points <= high + 1e-9)).all()
     off = of(form, points.T)
     if name == "heights":  # its sides are drawn down to the lowest height only
@@ -486,7 +486,7 @@ def every_kind() -> Mission:
 def test_figures_draw_every_kind(tmp_path):
     """Without a warning; what moves is drawn at several places, from first to last."""
     result = simulate(every_kind())
-    view = space.scene(result)
+    view = space.trajectory_scene(result)
     assert [s.name for s in view.shapes] == ["box 2", "moving", "cylinder 4", "hull 5", "heights 6"]
     moving = view.shapes[1]
     np.testing.assert_allclose(moving.at[[0, -1]], [[0, 0, 2], [4, 0, 2]], atol=1e-12)
@@ -500,7 +500,7 @@ def test_figures_draw_every_kind(tmp_path):
 def test_the_replay_has_surfaces_and_ways():
     """Corners of triangles lie on the solids; the way of what moves is that of the mission."""
     result = simulate(every_kind())
-    described = scene.describe(result, np.arange(len(result.edges)), 1.0)
+    described = scene.describe_scene(result, np.arange(len(result.edges)), 1.0)
     assert described["boxes"] == []
     names = [s["name"] for s in described["solids"]]
     assert names == ["box 2", "moving", "cylinder 4", "hull 5", "heights 6"]

@@ -49,7 +49,7 @@ def solver_of(p, edges, masses, law, *, eliminated=False, tolerance=1e-13) -> La
     if eliminated:
         steps = solvers.elimination_steps(len(p), edges)
         order = None if steps is None else ordering.prepare_order(steps, edges)
-    setup = Setup(order, cache(partial(solvers.dissection, p, edges)), tolerance)
+    setup = Setup(order, cache(partial(solvers.dissection_order, p, edges)), tolerance)
     return LargeSolver(vehicles, edges.astype(np.uint32), law, work, setup)
 
 
@@ -204,13 +204,13 @@ def test_factor_is_that_of_the_matrix(rng):
     """L L^T is K, block by block, in the order of the dissection."""
     p = lattice(4)
     edges, masses = graphs.neighbour_edges(p, 1.5), rng.uniform(0.5, 2.0, 64)
-    found = ordering.fill_pattern(64, edges, solvers.dissection(p, edges), 1e9)
+    found = ordering.symbolic_factorisation(64, edges, solvers.dissection_order(p, edges), 1e9)
     blocks, at = np.empty((len(found.row), 9)), np.empty(64, dtype=np.int64)
     u = directions(p, edges)
-    block_cholesky.assemble(
+    block_cholesky.assemble_blocks(
         u, edges, masses, 1.3, 0.1, found.place, found.column, found.of_edge, blocks
     )
-    assert block_cholesky.factor(
+    assert block_cholesky.factor_blocks(
         found.column, found.row, found.first, found.left, found.block, blocks, at
     )
     L = np.zeros((64, 3, 64, 3))
@@ -302,7 +302,7 @@ def test_order_of_the_sweep_is_found_whatever_the_numbers(rng):
 def test_dissection_orders_every_agent_once():
     """A permutation, of coincident points, too."""
     p = np.repeat(lattice(3), 2, axis=0)
-    assert sorted(solvers.dissection(p, graphs.complete_graph(54))) == list(range(54))
+    assert sorted(solvers.dissection_order(p, graphs.complete_graph(54))) == list(range(54))
 
 
 def flight(law: str, kind: str, **integrator) -> Mission:

@@ -16,7 +16,7 @@ from rigidfleet.foreign import shows
 from rigidfleet.foreign.files import read_trajectories
 from rigidfleet.mission import load_mission
 from rigidfleet.mission.kinds import Follow
-from rigidfleet.simulation.trajectories import of_curves
+from rigidfleet.simulation.trajectories import result_of_trajectories
 from rigidfleet.sweep.metrics import METRICS
 
 HEAD = "time_s,agent,x_m,y_m,z_m"
@@ -40,7 +40,7 @@ def line(start, velocity):
 
 def judged(path, spans="refuse", gaps="refuse", interpolation="cubic", **limits):
     read = read_trajectories(path, interpolation, spans=spans, gaps=gaps)
-    result = of_curves(read, **limits)
+    result = result_of_trajectories(read, **limits)
     result.statistics["notes"] = list(read.notes)
     return rf.assess(result)
 
@@ -169,7 +169,7 @@ def test_a_result_keeps_who_was_there(tmp_path):
         },
     )
     read = read_trajectories(path, spans="away")
-    result = of_curves(read._replace(away=True), separation=1.0)
+    result = result_of_trajectories(read._replace(away=True), separation=1.0)
     result.save(tmp_path / "r.nc")
     again = rf.Result.load(tmp_path / "r.nc")
     assert again.left.sum(axis=0)[0] > again.left.sum(axis=0)[1]

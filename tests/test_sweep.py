@@ -37,11 +37,11 @@ from rigidfleet.result import Extremum
 from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, merge, read
 from rigidfleet.sweep.figures import map_over_two, plot
 from rigidfleet.sweep.final_states import start_states
-from rigidfleet.sweep.metrics import measure
+from rigidfleet.sweep.metrics import measure_metrics
 from rigidfleet.sweep.run import GROUP, fly_runs
 from rigidfleet.sweep.runner import SweepProgress
-from rigidfleet.sweep.shards import own_runs
-from rigidfleet.sweep.summary import Example, drivers, rate, summarise
+from rigidfleet.sweep.shards import runs_of_shard
+from rigidfleet.sweep.summary import Example, correlations_by_strength, pass_rate, summarise
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "gain_study.toml"
 PAIR: dict[str, Any] = {
@@ -276,12 +276,12 @@ def test_metrics_of_vehicles_with_rotors():
     """Rotors as a share of their limit, saturation as a share of a phase, and tilt, as the verdict has them."""
     counts = {"steps": 1, "evaluations": 4}
     result, points = (replace(f(3, 10.0), statistics=counts) for f in (quadrotors, swarm))
-    found = measure(result, assess(result))
+    found = measure_metrics(result, assess(result))
     assert found["rotor_share"] == pytest.approx(1.0)
     assert found["tilt"] == pytest.approx(20.0)
     result.phases[0].extremes["saturation"] = Extremum(0.25, 5.0, 1, -1)
-    assert measure(result, assess(result))["saturation"] == pytest.approx(0.25)
-    of_points = measure(points, assess(points))
+    assert measure_metrics(result, assess(result))["saturation"] == pytest.approx(0.25)
+    of_points = measure_metrics(points, assess(points))
     assert all(math.isnan(of_points[name]) for name in ("rotor_share", "saturation", "tilt"))
     off = np.linalg.norm(result.position - result.slot_position, axis=2)
     assert found["tracking_error"] == of_points["tracking_error"] == off.max()
@@ -332,7 +332,7 @@ def test_a_way_is_searched_once_where_nothing_that_varies_matters_to_it(
     alone = simulate_together([Mission.from_dict(varied.varied(k)) for k in range(2)])
     assert count[0] == searches + 2
     for row, result in zip(rows, alone, strict=True):
-        own = measure(result, assess(result))
+        own = measure_metrics(result, assess(result))
         assert row.passed
         assert np.array_equal([*row.metrics.values()], [*own.values()], equal_nan=True)
 
@@ -646,7 +646,7 @@ def test_shards_are_merged_to_the_rows_of_one_run(flown, tmp_path, count):
 def test_shards_share_all_runs():
     """Each run is in one shard, with the others of its group of eight, however many shards there are."""
     for count in (1, 3, 40):
-        masks = np.array([own_runs(f"{k}/{count}", 1003) for k in range(1, count + 1)])
+        masks = np.array([runs_of_shard(f"{k}/{count}", 1003) for k in range(1, count + 1)])
         assert (masks.sum(axis=0) == 1).all()
         assert all(len({*np.flatnonzero(x[:1000]) // 8}) * 8 == x[:1000].sum() for x in masks)
         assert np.ptp(masks.sum(axis=1)) <= 8
@@ -1074,12 +1074,12 @@ def made(n: int = 400, runs: int | None = None) -> Table:
 
 def test_wilsons_interval():
     """The interval of a rate solves Wilson's equation |p - k/n| = z sqrt(p (1 - p) / n)."""
-    found = rate(np.arange(50) < 41)
+    found = pass_rate(np.arange(50) < 41)
     assert found.rate == 0.82
     z = stats.norm.ppf(0.975)
     for p in (found.low, found.high):
         assert abs(p - found.rate) == pytest.approx(z * math.sqrt(p * (1 - p) / 50))
-    assert rate(np.array([], dtype=bool)).high == 1.0
+    assert pass_rate(np.array([], dtype=bool)).high == 1.0
 
 
 def test_summary_finds_what_drives_failure():
@@ -1097,7 +1097,9 @@ def test_summary_finds_what_drives_failure():
     assert (found.drivers[0].varied, found.drivers[0].outcome) == ("agents.mass", "thrust")
     assert found.drivers[0].correlation == pytest.approx(1.0)
     radius = next(
-        d for d in drivers(table) if (d.varied, d.outcome) == ("agents.radius", "separation")
+        d
+        for d in correlations_by_strength(table)
+        if (d.varied, d.outcome) == ("agents.radius", "separation")
     )
     ranks = stats.rankdata(table.codes[:, 1]) - stats.rankdata(table.metrics["separation"])
     assert radius.correlation == pytest.approx(1 - 6 * (ranks**2).sum() / (400 * (400**2 - 1)))
@@ -1213,7 +1215,7 @@ def test_rank_correlations_are_those_of_scipy():
     thrust = np.round(table.metrics["thrust"] + noise.normal(0, 5, len(table.run)), 0)
     thrust[::7] = np.nan
     table = replace(table, metrics=table.metrics | {"thrust": thrust})
-    found = [d for d in drivers(table) if d.outcome == "thrust"]
+    found = [d for d in correlations_by_strength(table) if d.outcome == "thrust"]
     there = np.isfinite(thrust)
     assert len(found) == len(table.sweep.columns)
     for d in found:
@@ -1353,15 +1355,17 @@ def test_the_command_flies_shards(folder, capsys):
 def test_progress_words():
     """Progress says the runs flown, their rate without starts, the time left and the failures."""
     watch = console.SweepWatch()
-    assert watch._words() == ""
+    assert watch._progress_text() == ""
     watch.update(SweepProgress(0, 5000, 0, 0, 0.0, 1))
     watch.update(SweepProgress(8, 5000, 8, 0, 20.0, 1))
-    assert watch._words() == "8 of 5000 runs"
+    assert watch._progress_text() == "8 of 5000 runs"
     watch.update(SweepProgress(508, 5000, 508, 0, 30.0, 1))
-    assert watch._words() == "508 of 5000 runs  50 runs/s  1:30 left"
+    assert watch._progress_text() == "508 of 5000 runs  50 runs/s  1:30 left"
     watch.update(SweepProgress(1000, 5000, 1000, 0, 40.0, 2))
     watch.update(SweepProgress(2000, 5000, 2000, 30, 50.0, 2))
-    assert watch._words() == "2000 of 5000 runs  100 runs/s  0:30 left  30 failed  2 workers"
+    assert (
+        watch._progress_text() == "2000 of 5000 runs  100 runs/s  0:30 left  30 failed  2 workers"
+    )
 
 
 def test_interrupted(folder):
@@ -1563,7 +1567,7 @@ def test_a_seed_is_neither_an_axis_nor_a_driver(tmp_path):
         runs=8,
     )
     table = fly(found, tmp_path)
-    assert {d.varied for d in drivers(table)} == {"agents.mass.1", "agents.mass.2"}
+    assert {d.varied for d in correlations_by_strength(table)} == {"agents.mass.1", "agents.mass.2"}
     assert summarise(table).random_numbers == "varied"
     with pytest.raises(RigidfleetError, match="a seed has no order"):
         map_over_two(table, ["disturbances.noise.seed", "agents.mass.1"])
@@ -1577,7 +1581,7 @@ def test_drivers_are_corrected_for_their_number():
     table = replace(
         table, metrics=metrics, codes=noise.normal(size=(60, 2)), passed=noise.random(60) < 0.5
     )
-    found = drivers(table)
+    found = correlations_by_strength(table)
     chances = [d.chance for d in found]
     np.testing.assert_allclose(
         [d.adjusted for d in found], stats.false_discovery_control(chances), rtol=1e-12
@@ -1587,7 +1591,7 @@ def test_drivers_are_corrected_for_their_number():
     assert "rank correlation" not in text
     assert f"0 of {len(found)} pairs" in text
     assert json.loads(summarise(table).json())["pairs_tested"] == len(found)
-    few = drivers(made(4))
+    few = correlations_by_strength(made(4))
     assert abs(few[0].correlation) == 1.0
     assert few[0].chance == pytest.approx(
         2 / 24
@@ -1632,7 +1636,7 @@ def test_a_sweep_flies_a_controller_by_name(folder, capsys, monkeypatch):
     law: Any = sys.modules["a_law"]
     for k in (0, 8):
         flown = simulate(table.sweep.mission_of(k), controller=law.follow, rate=100.0)
-        assert measure(flown, assess(flown))["thrust"] == table.metrics["thrust"][k]
+        assert measure_metrics(flown, assess(flown))["thrust"] == table.metrics["thrust"][k]
     assert cli.main([*line, "--out", "1"]) == codes.BAD_INPUT
     assert "differs in: file of the controller, controller, rate" in capsys.readouterr().err
 
@@ -1704,7 +1708,7 @@ def test_a_full_disk_is_named_and_the_sweep_goes_on(flown, tmp_path, monkeypatch
     """Where SQLite finds the disk full in mid-sweep, one error says so; with room, the sweep ends as ever."""
     from rigidfleet.sweep.store import Store
 
-    opened = Store._open
+    opened = Store._open_database
 
     def small(self: Store, asked: Sweep) -> None:
         opened(self, asked)
@@ -1712,7 +1716,7 @@ def test_a_full_disk_is_named_and_the_sweep_goes_on(flown, tmp_path, monkeypatch
         self.db.execute(f"PRAGMA max_page_count = {pages}")
 
     with monkeypatch.context() as full:
-        full.setattr(Store, "_open", small)
+        full.setattr(Store, "_open_database", small)
         with pytest.raises(ResultError, match=r"the disk is full\. Make room"):
             fly(sweep(), tmp_path, workers=1)
     assert numbers(fly(sweep(), tmp_path, workers=1)) == numbers(flown)

@@ -10,7 +10,7 @@ from rigidfleet.assessment import assess
 from rigidfleet.kernel.compiler.simd import empty, pack, unpack
 from rigidfleet.kernel.engine import batch, codegen, lane_steps, native
 from rigidfleet.kernel.engine.tracer import Code, FlightTrace, UnfitError, numbers
-from rigidfleet.kernel.gauge import read_gauge
+from rigidfleet.kernel.gauge import write_force_gauge
 from rigidfleet.kernel.problem import Problem, workspace
 from rigidfleet.kernel.records import FIRST_ROW, TRAILED
 from rigidfleet.mission import Mission, load_mission
@@ -192,7 +192,7 @@ def kernel(p: Problem, y: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]
     n, m = len(p.vehicles.m), len(p.graph.edges)
     w, dy, values = workspace(n, m, solver=p.law.solver), np.empty_like(y), np.empty(5 * n + 2 * m)
     native.closed_loop(t, y, dy, p, w)
-    read_gauge(p, w, values)
+    write_force_gauge(p, w, values)
     return dy, values
 
 

@@ -14,7 +14,7 @@ import rigidfleet as rf
 from rigidfleet.math.bernstein import greatest_convex_value
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Mission
-from rigidfleet.simulation.trajectories import of_curve
+from rigidfleet.simulation.trajectories import result_of_curve
 
 
 def check_of(verdict, name):
@@ -279,7 +279,7 @@ def test_long_pieces_of_any_degree_are_watched_exactly(powers):
     time = np.array([0.0, 10.0, 20.0])
     ends = rng.normal(0, 3, (powers // 2, 3, 2, 4))
     curve = Piecewise.hermite(time, ends)
-    flight = of_curve(curve, "a curve", separation=0.0)
+    flight = result_of_curve(curve, "a curve", separation=0.0)
     dense = np.linspace(0.0, 20.0, 400_001)
     r = curve.at(dense)[..., :3]
     extremes = flight.phases[0].extremes
@@ -301,14 +301,14 @@ import numpy as np
 import rigidfleet as rf
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.piecewise import join
-from rigidfleet.simulation.trajectories import of_curve
+from rigidfleet.simulation.trajectories import result_of_curve
 from scipy.interpolate import CubicSpline
 rng, t = np.random.default_rng(3), np.arange(480) * 0.1
 curves = []
 for i in range(1000):
     x = [3.0 * (i % 32), 3.0 * (i // 32), 20.0, 0.0] + np.sin(0.3 * t[:, None] + rng.uniform(0, 6, 4)) / 2
     curves.append(Piecewise(t, np.ascontiguousarray(np.moveaxis(CubicSpline(t, x).c[::-1], 0, -1))))
-assert rf.assess(of_curve(join(curves), "splines", separation=0.5)).passed
+assert rf.assess(result_of_curve(join(curves), "splines", separation=0.5)).passed
 print(next(x.split()[1] for x in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in x))
 """
     process = subprocess.run(

@@ -9,7 +9,7 @@ from scipy.spatial.distance import pdist
 
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.planning.certificate import CLOSE, of_ways
-from rigidfleet.planning.transfers import Transfer, least_duration, transfer
+from rigidfleet.planning.transfers import Transfer, least_duration, plan_transfer
 
 BOX = ((-1.5, -1.5, 0.2), (1.5, 1.5, 2.2))
 LIMITS: dict[str, Any] = {
@@ -35,7 +35,7 @@ def test_all_arrive_within_all_limits(n, downwash):
     """Judged by ten thousand samples of SciPy's B-splines: places, rest, speed, acceleration, box and distance."""
     rng = np.random.default_rng((3, n))
     start, goal = scattered(rng, n, downwash), scattered(rng, n, downwash)
-    found = transfer(start, goal, downwash=downwash, **LIMITS)
+    found = plan_transfer(start, goal, downwash=downwash, **LIMITS)
     assert found is not None
     spans = len(found.control) - 3
     spline = BSpline(np.arange(-3, spans + 4) * found.duration / spans, found.control, 3)
@@ -58,7 +58,7 @@ def test_vehicles_change_sides_of_a_ring():
     """All straight ways meet in one point; none of those found does."""
     angle = np.arange(8) * np.pi / 4
     start = np.stack([1.2 * np.cos(angle), 1.2 * np.sin(angle), 1.2 + 0.0 * angle], axis=1)
-    found = transfer(start, np.roll(start, 4, axis=0), **LIMITS)
+    found = plan_transfer(start, np.roll(start, 4, axis=0), **LIMITS)
     assert found is not None
     assert found.certificate.separation >= 0.3
 
@@ -109,25 +109,25 @@ def test_no_way_is_none():
     """Two cannot pass each other in a corridor that is as wide as one."""
     start = np.array([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
     within: dict[str, Any] = LIMITS | {"box": ((-1.5, 0.0, 1.0), (1.5, 0.0, 1.0))}
-    assert transfer(start, start[::-1], **within) is None
+    assert plan_transfer(start, start[::-1], **within) is None
 
 
 def test_vehicles_that_begin_too_near_are_named():
     """Nothing is searched for."""
     start = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [0.6, 0.0, 1.0]])
     with pytest.raises(ValueError, match=r"vehicles 2 and 3 are 0\.1 m apart at the start"):
-        transfer(start, start + [0, 1, 0], **LIMITS)
+        plan_transfer(start, start + [0, 1, 0], **LIMITS)
 
 
 def test_the_same_seed_finds_the_same_ways():
     """To the last bit; and where nobody has to move, nobody does."""
     rng = np.random.default_rng(0)
     start = scattered(rng, 5, 1.0)
-    one, two = (transfer(start, start[::-1], seed=4, **LIMITS) for _ in range(2))
+    one, two = (plan_transfer(start, start[::-1], seed=4, **LIMITS) for _ in range(2))
     assert isinstance(one, Transfer)
     assert isinstance(two, Transfer)
     np.testing.assert_array_equal(one.control, two.control)
-    still = transfer(start, start, **LIMITS)
+    still = plan_transfer(start, start, **LIMITS)
     assert still is not None
     assert np.ptp(still.control, axis=0).max() < 1e-6
 
@@ -136,7 +136,9 @@ def test_opposite_places():
     """Vehicles on a circle that all go to the opposite place, and so would all meet in its middle, have proved ways."""
     angle = 2.0 * np.pi * np.arange(16) / 16
     s = 4.0 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
-    found = transfer(s, -s, distance=0.5, speed=1.7, acceleration=2.9, box=([-6.0] * 3, [6.0] * 3))
+    found = plan_transfer(
+        s, -s, distance=0.5, speed=1.7, acceleration=2.9, box=([-6.0] * 3, [6.0] * 3)
+    )
     assert found is not None
     assert found.certificate.separation >= 0.5
     ways = Piecewise.b_spline(found.control, found.duration)

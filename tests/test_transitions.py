@@ -10,7 +10,7 @@ from scipy.spatial.distance import pdist
 from rigidfleet import assess, check, simulate
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.timing import complete_times
 
 
@@ -102,14 +102,14 @@ def test_automatic_times_are_shared_out():
     data["phases"][1] |= {"blend": "auto", "duration": "auto"}
     data["limits"] |= {"speed": 2.0, "acceleration": 1.0}
     mission = complete_times(Mission.from_dict(data))
-    for planned, phase in list(zip(preview(mission)[0], mission.phases, strict=True))[1:]:
+    for planned, phase in list(zip(preview_phases(mission)[0], mission.phases, strict=True))[1:]:
         assert isinstance(phase.least_time, float)
         speed = np.linalg.norm(planned.velocity, axis=2).max()
         acceleration = np.linalg.norm(planned.acceleration, axis=2).max()
         assert speed <= 2.0 * 1.001
         assert acceleration <= 1.0 * 1.001
         assert max(speed / 2.0, acceleration) >= 0.95
-    for a, b in pairwise(preview(mission)[0]):
+    for a, b in pairwise(preview_phases(mission)[0]):
         np.testing.assert_allclose(a.position[-1], b.position[0], atol=1e-9)
 
 
@@ -141,5 +141,7 @@ def test_a_way_without_alignment_is_straight_in_the_axes_of_the_body():
         data["agents"]["position"] = (square + [0, 0, 30]).tolist()
         data["formations"]["a"]["slots"] = square.tolist()
         data["formations"]["b"]["slots"] = np.roll(square, 1, axis=0).tolist()
-        radii = np.linalg.norm(preview(Mission.from_dict(data))[0][1].position[..., :2], axis=2)
+        radii = np.linalg.norm(
+            preview_phases(Mission.from_dict(data))[0][1].position[..., :2], axis=2
+        )
         assert radii.min() == pytest.approx(least, abs=1e-6)

@@ -21,7 +21,7 @@ from rigidfleet.errors import ResultError, RigidfleetError, SweepError
 from rigidfleet.sweep import Sweep, metrics, read
 from rigidfleet.tuning.gains import RANGES, GainSpace, Screen, own_gains, with_gains
 from rigidfleet.tuning.outcome import Flown
-from rigidfleet.tuning.study import OBJECTIVES, _Study, cost
+from rigidfleet.tuning.study import OBJECTIVES, _Study, objective_cost
 
 TEXT = """# a pair of quadrotors
 schema_version = 1
@@ -137,11 +137,11 @@ def test_gains_that_act_are_tuned():
 def test_space_holds_the_own_gains():
     """The start is the mission's own gains; the ends are as far as the box reaches."""
     space = GainSpace({"constraint.alpha": 3.0, "tracking.Q.1": 4.0})
-    assert space.gains(space.start) == space.own
+    assert space.gains_at(space.own_point) == space.own
     odd = GainSpace({"constraint.beta": math.sqrt(12)})
-    assert odd.gains(odd.start) == odd.own
-    assert space.gains([0.0, 0.0]) == {"constraint.alpha": 0.75, "tracking.Q.1": 0.25}
-    assert space.gains([1.0, 1.0]) == {"constraint.alpha": 12.0, "tracking.Q.1": 64.0}
+    assert odd.gains_at(odd.own_point) == odd.own
+    assert space.gains_at([0.0, 0.0]) == {"constraint.alpha": 0.75, "tracking.Q.1": 0.25}
+    assert space.gains_at([1.0, 1.0]) == {"constraint.alpha": 12.0, "tracking.Q.1": 64.0}
 
 
 def test_margins_are_those_of_check():
@@ -152,7 +152,7 @@ def test_margins_are_those_of_check():
         found = rf.check(rf.Mission.from_toml(with_gains(TEXT, gains))).margins
         assert found is not None
         assert found.tracking is not None
-        margins = screen.margins(gains)
+        margins = screen.margins_by_law(gains)
         assert margins["tracking"].phase == pytest.approx(found.tracking.phase, rel=1e-6)
         every = [f.margins for f in found.formations.values()]
         law = margins["constraint law"]
@@ -160,13 +160,13 @@ def test_margins_are_those_of_check():
         assert law.delay == pytest.approx(min(m.delay for m in every), rel=1e-6)
         assert law.gain[1] == pytest.approx(min(m.gain[1] for m in every), rel=1e-6)
     own = own_gains(PAIR)
-    assert screen.slack(own) == pytest.approx(0.0, abs=1e-6)
-    assert screen.slack(own | {"constraint.beta": 2.9, "constraint.gamma": 2.0}) >= 0
-    assert screen.slack(own | {"constraint.gamma": 9.0}) < 0  # less phase
-    assert screen.slack(own | {"constraint.alpha": 12.0}) < 0  # less delay
-    assert screen.slack(own | {"tracking.Q.1": 16.0}) < 0
-    assert Screen(PAIR, 0.5).slack(own | {"tracking.Q.1": 16.0}) > 0
-    assert Screen(PAIR, 0.0).slack(own | {"constraint.gamma": 300.0}) == -1  # unstable
+    assert screen.margin_slack(own) == pytest.approx(0.0, abs=1e-6)
+    assert screen.margin_slack(own | {"constraint.beta": 2.9, "constraint.gamma": 2.0}) >= 0
+    assert screen.margin_slack(own | {"constraint.gamma": 9.0}) < 0  # less phase
+    assert screen.margin_slack(own | {"constraint.alpha": 12.0}) < 0  # less delay
+    assert screen.margin_slack(own | {"tracking.Q.1": 16.0}) < 0
+    assert Screen(PAIR, 0.5).margin_slack(own | {"tracking.Q.1": 16.0}) > 0
+    assert Screen(PAIR, 0.0).margin_slack(own | {"constraint.gamma": 300.0}) == -1  # unstable
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_failures_are_worse_than_errors():
         Flown({}, 0, 0, 2, {"e": [0.0, 0.0]}),
         Flown({}, 1, 1, 2, {"e": [0.0, math.nan]}),
     ]
-    costs = [cost(f, "e") for f in flown]
+    costs = [objective_cost(f, "e") for f in flown]
     assert all(a < b for a, b in pairwise(costs))
     assert costs[0] == pytest.approx(25.45)
 
@@ -263,7 +263,7 @@ def test_study_resumes(study, tmp_path):
     more = small(PAIR, tmp_path, progress=told.append, budget=50)
     assert whole.flights < more.flights <= 50
     assert told[-1].flown <= more.flights - whole.flights + 2 * SMALL["validation"]
-    assert cost(more.after, more.metric) <= cost(whole.after, more.metric)
+    assert objective_cost(more.after, more.metric) <= objective_cost(whole.after, more.metric)
 
 
 def test_what_is_there_is_kept(study, tmp_path):
@@ -425,7 +425,7 @@ def test_parts_of_a_flight_are_told_apart():
     wanted = np.array([np.linalg.norm(slots[:, i] - slots[:, j], axis=1) for i, j in pairs])
     with_slots = np.nanmax(np.abs(off(here, wanted)))
     by_forces = np.abs(off(here, result.distance_reference.T))[:, first].max()
-    found = metrics.measure(result, rf.assess(result))
+    found = metrics.measure_metrics(result, rf.assess(result))
     assert found["shape_tracked"] == pytest.approx(with_slots, rel=1e-6)
     assert found["shape_forces"] == pytest.approx(by_forces, rel=1e-6)
     assert found["shape_flight"] == max(found["shape_tracked"], found["shape_forces"])

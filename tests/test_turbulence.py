@@ -113,7 +113,7 @@ def test_recursions_are_followed_along_rows(backward):
     x, a = white((7, 4)), white(7, seed=2)
     L = np.eye(7) - np.diag(a[:-1] if backward else a[1:], 1 if backward else -1)
     expected = np.linalg.solve(L, x)
-    native.recurse(x, a, backward=backward)
+    native.run_linear_recursion(x, a, backward=backward)
     np.testing.assert_allclose(x, expected, rtol=1e-12, atol=1e-12)
 
 

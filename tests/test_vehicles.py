@@ -8,7 +8,7 @@ import pytest
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission
 from rigidfleet.mission.schema import Vehicle
-from rigidfleet.mission.vehicles import MODELS, resolve
+from rigidfleet.mission.vehicles import MODELS, model_of_vehicle
 
 PLACES = [[0.0, 0.0, 5.0], [4.0, 0.0, 5.0], [0.0, 4.0, 5.0]]
 
@@ -35,7 +35,7 @@ def refusal(*arguments, **changes) -> str:
 @pytest.mark.parametrize("name", MODELS)
 def test_models_can_fly(name):
     """Each model hovers well below its limit, has a source for each number, and a stable attitude control."""
-    model = resolve(Vehicle(model=name))
+    model = model_of_vehicle(Vehicle(model=name))
     assert 0.05 < model.mass * 9.81 / model.thrust_limit < 0.6
     assert all(source for _, source in MODELS[name].values())
     k_R, k_omega = model.attitude_gains
@@ -45,7 +45,7 @@ def test_models_can_fly(name):
 
 def test_the_paper_gives_mass_and_thrust():
     """The paper's vehicle has a kilogram and four rotors of 5.9 N; what the paper leaves open is marked as chosen."""
-    model = resolve(Vehicle(model="paper"))
+    model = model_of_vehicle(Vehicle(model="paper"))
     assert (model.mass, model.rotor_limit) == (1.0, pytest.approx(5.9))
     chosen = {key for key, (_, source) in MODELS["paper"].items() if source.startswith("chosen")}
     assert chosen == set(MODELS["paper"]) - {"mass", "thrust_coefficient"}

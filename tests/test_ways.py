@@ -16,7 +16,7 @@ from rigidfleet.planning import ways
 from rigidfleet.planning.clearance import closest, greatest_speeds, speed_bounds
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.lattice import FreeSpace, keeps_room
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.timing import complete_times, expand_mission
 from rigidfleet.simulation.flight import Flight
 
@@ -64,7 +64,7 @@ def wall(width: float, y: float = 0.0, **turned: float) -> list[dict[str, Any]]:
 def sampled(mission: Mission) -> float:
     """Least distance [m] of a vehicle's surface from a box along the axes, a sphere or an upright cylinder: samples."""
     least = np.inf
-    for planned in preview(complete_times(mission))[0]:
+    for planned in preview_phases(complete_times(mission))[0]:
         r = planned.position
         for o in mission.obstacles:
             if o.kind == "box":
@@ -109,7 +109,7 @@ def test_each_kind_of_obstacle_is_flown_round(kind):
     assert min(clearance for _, clearance, *_ in ahead.clearance) >= 0.5
     if kind in ("box", "sphere", "cylinder", "zone"):
         assert sampled(mission) >= 0.5
-    goal = preview(complete_times(mission))[0][-1].leg.after.goal
+    goal = preview_phases(complete_times(mission))[0][-1].leg.planned_end_state.goal
     assert goal is not None
     assert np.array_equal(goal.r, [12, 0, 8])
 
@@ -267,7 +267,7 @@ def test_many_agents_find_a_way_as_one_ball():
 @pytest.mark.parametrize("name", ["narrow-passage", "cube-passage", "show-1000"])
 def test_speeds_between_samples_are_bounded(name):
     """No slot is faster within a span than its bound, and the bounds of short spans are close."""
-    for planned in preview(complete_times(load_mission(name)))[0]:
+    for planned in preview_phases(complete_times(load_mission(name)))[0]:
         leg, time = planned.leg, planned.time[::10]
         bound = greatest_speeds(leg.reference, leg.motion, time[:-1], time[1:])
         inside = time[:-1, None] + np.linspace(0, 1, 7)[1:-1] * np.diff(time)[:, None]
@@ -283,7 +283,7 @@ def test_the_least_clearance_is_between_samples():
     data = going(plate).to_dict()
     data["phases"][1] = {"kind": "fly", "position": [12, 0, 8], "duration": 4.0}
     mission = Mission.from_dict(data)
-    planned = preview(mission)[0][1]
+    planned = preview_phases(mission)[0][1]
     found = closest(planned, mission.obstacles[0], mission.fleet.radius, speed_bounds(planned))
     t = np.linspace(planned.time[0], planned.time[-1], 40001)
     r = slot_derivatives(planned.leg.reference, planned.leg.motion, t, 1)[:, 0]
@@ -310,7 +310,7 @@ def test_the_least_clearance_of_many_is_between_samples(at_once, monkeypatch):
     """Also where not all vehicles and spans fit at once."""
     monkeypatch.setattr("rigidfleet.planning.clearance._AT_ONCE", at_once)
     mission = past_a_ball(1000)
-    planned = preview(mission)[0][0]
+    planned = preview_phases(mission)[0][0]
     found = closest(planned, mission.obstacles[0], mission.fleet.radius, speed_bounds(planned))
     assert found.proved == found.clearance - 1e-3
     t = np.linspace(found.time - 0.3, found.time + 0.3, 6001)
@@ -328,7 +328,7 @@ def test_what_a_check_has_no_time_to_prove_is_told(monkeypatch):
     """The bound holds, is worse than a millimetre, and is said."""
     monkeypatch.setattr("rigidfleet.planning.clearance._IN_ALL", 10_000)
     mission = past_a_ball(1000)
-    planned = preview(mission)[0][0]
+    planned = preview_phases(mission)[0][0]
     found = closest(planned, mission.obstacles[0], mission.fleet.radius, speed_bounds(planned))
     t = np.linspace(planned.time[0], planned.time[-1], 4001)
     r = slot_derivatives(planned.leg.reference, planned.leg.motion, t, 1)[:, 0]
@@ -350,9 +350,9 @@ def test_a_fence_is_compared_exactly():
     looks = []
 
     class Counting(FreeSpace):
-        def room_beside_obstacles(self, r, radius, most):
+        def room_to_obstacles(self, r, radius, most):
             looks.append(len(r))
-            return super().room_beside_obstacles(r, radius, most)
+            return super().room_to_obstacles(r, radius, most)
 
     space, radius, need = Counting([], fence), np.full(3, 0.1), 0.2
     share = np.linspace(0.0, 1.0, 2001)

@@ -48,7 +48,7 @@ def derivatives(
     out, none = np.empty_like(S), np.zeros(3)
     for i in range(len(S)):
         wind = none if air is None else air[i]
-        quadrotor.derivative(
+        quadrotor.quadrotor_derivative(
             S[i], command[i], i, flight.vehicles, flight.air, wind, none, np.eye(3), out[i]
         )
     return out
@@ -103,7 +103,7 @@ def open_problem(vehicles: fleet.Quadrotors) -> Problem:
     """A problem without edges, whose input force ``control.force`` (N, 3) [N] can be overwritten between ticks."""
     m = vehicles.m.copy()
     n = len(m)
-    return packing.examples()[0]._replace(
+    return packing.example_tuples()[0]._replace(
         vehicles=Vehicles(m, 1 / m, m.sum(), m.mean(), np.full(n, np.inf), False, vehicles.g),
         graph=graph(np.zeros((0, 2), dtype=np.int64), m),
         control=Control(OPEN, np.zeros((n, 3)), 0.0, 0.0, RIGID),
@@ -120,7 +120,7 @@ def begun(
     rows: int = 0,
 ) -> tuple[Problem, Workspace, fleet.SampledFlight, fleet.SampledState]:
     """Vehicles that hover side by side, or at r (N, 3), under a problem without edges that balances their weight."""
-    fleet_ = fleet.quadrotors(vehicles, G)
+    fleet_ = fleet.quadrotor_arrays(vehicles, G)
     n = len(vehicles)
     flight = fleet.ideal_flight(fleet_, start=0.0, h=h, steps=steps)
     problem, work = open_problem(fleet_), workspace(n, 0)
@@ -138,7 +138,7 @@ def planned(
     now = PhaseState(0.0, np.array(mission.agents.position), np.array(mission.agents.velocity))
     plan = plan_phase(mission, leg_of(mission, mission.phases[index], now))
     n = len(now.r)
-    fleet_ = fleet.quadrotors([vehicle] * n, plan.problem.vehicles.g)
+    fleet_ = fleet.quadrotor_arrays([vehicle] * n, plan.problem.vehicles.g)
     flight = fleet.ideal_flight(fleet_, start=plan.start, h=h, steps=steps, every=every)
     work = workspace(n, len(plan.edges), solver=plan.problem.law.solver)
     S = fleet.hover_states(fleet_, now.r, now.v)
@@ -178,7 +178,9 @@ def rotorpy_derivative(
 
 def random_inputs(vehicle: fleet.VehicleDynamics) -> tuple[np.ndarray, np.ndarray]:
     """A hovering state (17,) and commands (50, 4), each held for 20 ms."""
-    S = fleet.hover_states(fleet.quadrotors([vehicle], G), np.zeros((1, 3)), np.zeros((1, 3)))[0]
+    S = fleet.hover_states(
+        fleet.quadrotor_arrays([vehicle], G), np.zeros((1, 3)), np.zeros((1, 3))
+    )[0]
     scatter = np.random.default_rng(5).uniform(0.9, 1.1, size=(50, 4))
     return S, S[13:] * scatter
 

@@ -34,7 +34,7 @@ class Finding:
     def __str__(self) -> str:
         where = ": ".join(part for part in (self.file, self.key) if part)
         text = str(self.value).lower() if isinstance(self.value, bool) else repr(self.value)
-        value = "" if self.value is None else f" = {_short(text)}"
+        value = "" if self.value is None else f" = {_shorten_text(text)}"
         head = f"{where}{value}: {self.problem}" if where else self.problem
         return f"{head}\n    {self.remedy}" if self.remedy else head
 
@@ -88,11 +88,11 @@ class FlightError(RigidfleetError):
 
 def wrong_type(expected: str, value: object) -> TypeError:
     """Return a TypeError that names what was expected and what was given."""
-    shown = _short(" ".join(repr(value).split()))
+    shown = _shorten_text(" ".join(repr(value).split()))
     return TypeError(f"expected {expected}, got {shown} ({type(value).__name__})")
 
 
-def _short(text: str) -> str:
+def _shorten_text(text: str) -> str:
     return text if len(text) <= _WIDTH else text[: _WIDTH - 3] + "..."
 
 

@@ -58,7 +58,7 @@ def states_of_motion(
     return x
 
 
-def at_rate(samples: Setpoints, rate: float | None) -> Setpoints:
+def setpoints_at_rate(samples: Setpoints, rate: float | None) -> Setpoints:
     """Setpoints at a rate [Hz] from the first time on; without one, at their own times.
 
     Where two times are one representable number apart, as at a switch of phases, the later one counts.

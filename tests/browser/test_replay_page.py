@@ -22,7 +22,7 @@ from test_policy import HOSTILE, flight
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.reporting import report
-from rigidfleet.web.replay import html_page, replay
+from rigidfleet.web.replay import replay, replay_page
 
 pytestmark = pytest.mark.long
 
@@ -167,7 +167,7 @@ def served(tmp_path, eight) -> Iterator[str]:
     """Address of a page that loads the modules as they stand, not put together into one."""
     with resources.as_file(resources.files("rigidfleet.web")) as web:
         shutil.copytree(web, tmp_path, ignore=shutil.ignore_patterns("*.py*"), dirs_exist_ok=True)
-    text = re.sub(r"<meta http-equiv=[^>]*>", "", html_page(eight))
+    text = re.sub(r"<meta http-equiv=[^>]*>", "", replay_page(eight))
     script = '<script type="module" src="replay/replay.js"></script>'
     text = re.sub(r'<script type="module">.*?</script>', script, text, flags=re.DOTALL)
     (tmp_path / "index.html").write_text(text, encoding="utf-8")

@@ -9,9 +9,9 @@ import numpy as np
 import rigidfleet as rf
 from rigidfleet.assessment import safety
 from rigidfleet.mission import json_schema
-from rigidfleet.reporting import html_page
+from rigidfleet.reporting import report_page
 from rigidfleet.sweep import METRICS
-from rigidfleet.sweep.metrics import measure
+from rigidfleet.sweep.metrics import measure_metrics
 
 sys.path.insert(0, "docs")
 tables = importlib.import_module("tables")  # of the patched copy
@@ -25,13 +25,13 @@ for limit, passes in ((1.01 * greatest, True), (0.5 * greatest, False)):
     assert check.passed == passes == verdict.passed, verdict.summary
     assert check.worst is not None
     assert greatest * (1 - 1e-9) <= check.worst <= 1.01 * greatest
-    assert measure(result, verdict)["constraint_force"] == check.worst
+    assert measure_metrics(result, verdict)["constraint_force"] == check.worst
     (row,) = [row for row in safety(result, verdict) if row.quantity == "constraint force"]
     assert row.passed == passes
     assert row.margin is not None
     assert (row.margin > 0.0) == passes
 
-assert html_page(result).count('class="words">constraint force') == 2
+assert report_page(result).count('class="words">constraint force') == 2
 assert METRICS["constraint_force"].unit == "N"
 assert json_schema()["$defs"]["Limits"]["properties"]["constraint_force"]["description"]
 assert "| `constraint_force` | number |" in tables.render(Path("docs/missions.md").read_text())

@@ -132,21 +132,21 @@ class FactTable:
     def html(self, kind: str = "") -> str:
         """The table in a notebook, or as a table of this kind on a page, which has a style for it."""
 
-        def look(words: bool, level: str = "") -> str:
+        def cell_attribute(words: bool, level: str = "") -> str:
             names = f"{'words' * words} {level}".strip()
             return _LOOK if not kind else f' class="{names}"' if names else ""
 
         heads = "".join(
-            f"<th{look(words)}>{html.escape(f'{name} [{unit}]' if unit else name)}</th>"
+            f"<th{cell_attribute(words)}>{html.escape(f'{name} [{unit}]' if unit else name)}</th>"
             for name, unit, words in self.columns
         )
         body = f"<thead><tr>{heads}</tr></thead>" * (not self.bare)
         for row, cells in zip(self.rows, self.cells, strict=True):
             line = "".join(
-                f"<td{look(words, cell.level)}>{cell.html()}</td>"
+                f"<td{cell_attribute(words, cell.level)}>{cell.html()}</td>"
                 for cell, (*_, words) in zip(cells, self.columns, strict=True)
             )
-            body += f"<tr{look(False, row.level) if kind else ''}>{line}</tr>"
+            body += f"<tr{cell_attribute(False, row.level) if kind else ''}>{line}</tr>"
         return f"<table{f' class={kind!r}' if kind else ''}>{body}</table>"
 
     def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
@@ -157,7 +157,7 @@ class FactTable:
         columns, space = self.columns, 2 if len(self.columns) < _MANY else 1
         below = "\n" if sum(bool(unit) for _, unit, _ in columns) > 1 else " "
         heads = [f"{x}{below}{f'[{unit}]' * bool(unit)}".rstrip(" ") for x, unit, _ in columns]
-        widths = self._widths(heads, options.max_width - space * (len(columns) - 1))
+        widths = self._column_widths(heads, options.max_width - space * (len(columns) - 1))
         if widths is None:
             half = len(self.heads) // 2 + 1
             for some in (range(half), (0, *range(half, len(self.heads)))):
@@ -177,7 +177,7 @@ class FactTable:
             heading = first
         yield grid
 
-    def _widths(self, heads: list[str], room: int) -> list[int] | None:
+    def _column_widths(self, heads: list[str], room: int) -> list[int] | None:
         """Width of each column, the widest words wrapped first; None if words would be torn apart."""
         from rich.cells import cell_len
 
@@ -244,7 +244,7 @@ def table_of(rows: Sequence[Mapping[str, Any]], words: Collection[str] = ()) -> 
     return FactTable(heads, [Row([row.get(name) for name in heads]) for row in rows], words)
 
 
-def worst_values(what: str, facts: Iterable[Fact]) -> FactTable:
+def table_of_worst_values(what: str, facts: Iterable[Fact]) -> FactTable:
     """Table of worst values with their limits."""
     heads = (what, "worst", "true value", "limit", "at [s]", "who or where")
     return FactTable(heads, [fact.row for fact in facts], heads[5:])

@@ -19,7 +19,7 @@ def report_steps_to(update: Callable[[str], None]) -> Generator[None]:
         _watcher.reset(before)
 
 
-def report(step: str) -> None:
+def report_step(step: str) -> None:
     """Say what is done next, in words."""
     if (update := _watcher.get()) is not None:
         update(step)

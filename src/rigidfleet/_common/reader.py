@@ -53,7 +53,7 @@ class Array:
 
 
 def read_attribute(file: h5py.File, name: str, kind: Any) -> Any:
-    """Return an attribute as ``int`` or ``str``, or the JSON in it as any other type (`as_type`).
+    """Return an attribute as ``int`` or ``str``, or the JSON in it as any other type (`of_type`).
 
     Raises
     ------
@@ -82,10 +82,10 @@ def read_attribute(file: h5py.File, name: str, kind: Any) -> Any:
         plain = json.loads(value)
     except (ValueError, RecursionError) as error:
         raise DamagedError(f"attribute {name} is not valid JSON ({error})") from None
-    return as_type(plain, kind, f"attribute {name}")
+    return of_type(plain, kind, f"attribute {name}")
 
 
-def as_type(value: Any, kind: Any, where: str) -> Any:
+def of_type(value: Any, kind: Any, where: str) -> Any:
     """Check plain data against a type and return it.
 
     Types are dataclasses, typed dictionaries, lists, tuples, literals, text, integers and finite numbers. A dataclass
@@ -101,10 +101,10 @@ def as_type(value: Any, kind: Any, where: str) -> Any:
     if kind is Any:
         return value
     if origin is Annotated:  # A is the type in Python, B the type in a file
-        return None if value is None else as_type(value, inner[1], where)
+        return None if value is None else of_type(value, inner[1], where)
     if origin in (Union, UnionType):  # every union here is `X | None`
         some = next(k for k in inner if k is not NoneType)
-        return None if value is None else as_type(value, some, where)
+        return None if value is None else of_type(value, some, where)
     if origin is Literal and isinstance(value, str) and value in inner:
         return value
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
@@ -114,12 +114,12 @@ def as_type(value: Any, kind: Any, where: str) -> Any:
         if kind is not str or _is_text(value):
             return value
     elif origin is list and isinstance(value, list):
-        return [as_type(item, inner[0], f"{where}[{k + 1}]") for k, item in enumerate(value)]
+        return [of_type(item, inner[0], f"{where}[{k + 1}]") for k, item in enumerate(value)]
     elif origin is tuple and isinstance(value, list) and len(value) == len(inner):
-        return [as_type(item, k, where) for item, k in zip(value, inner, strict=True)]
+        return [of_type(item, k, where) for item, k in zip(value, inner, strict=True)]
     elif isinstance(value, dict):
         if origin is dict:
-            return {key: as_type(item, inner[1], f"{where}.{key}") for key, item in value.items()}
+            return {key: of_type(item, inner[1], f"{where}.{key}") for key, item in value.items()}
         hints = get_type_hints(kind, include_extras=True)
         needed = getattr(kind, "__required_keys__", None)
         if needed is None:  # a dataclass
@@ -128,7 +128,7 @@ def as_type(value: Any, kind: Any, where: str) -> Any:
         known = hints.keys() - {"__others__"}
         if needed <= value.keys() and ("__others__" in hints or value.keys() <= known):
             made = {
-                key: as_type(item, hints.get(key, Any), f"{where}.{key}")
+                key: of_type(item, hints.get(key, Any), f"{where}.{key}")
                 for key, item in value.items()
             }
             return kind(**made)

@@ -35,15 +35,15 @@ def rename_hint(key: object, value: object = None) -> str:
 def with_earlier_names(**new: str) -> Callable[[_C], _C]:
     """Give a class its members by earlier names, too: each with the name of now."""
 
-    def give(kind: _C) -> _C:
+    def add_properties(kind: _C) -> _C:
         for old in new:
             setattr(kind, old, property(partial(_current_member, new=new, old=old)))
         return kind
 
-    return give
+    return add_properties
 
 
-def earlier_names(module: str, **new: str) -> Callable[[str], Any]:
+def getattr_of_earlier_names(module: str, **new: str) -> Callable[[str], Any]:
     """The `__getattr__` of a module that has functions by earlier names, too: each with the name of now."""
     return partial(_current_member, sys.modules[module], new)
 

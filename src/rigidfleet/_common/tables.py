@@ -92,8 +92,8 @@ class TextTable:
         self, data: bytes, unnamed: Mapping[int, list[str]], words: Mapping[str, str] | None = None
     ) -> None:
         self.texts, self.words = _lines(data), words or {}
-        self.line, start, self.names, below, self.separator, width = _find_head(self.texts)
-        rows = _rows(self.texts, start, width, self.separator, self.line)
+        self.line, start, self.names, below, self.separator, width = _find_header(self.texts)
+        rows = _read_rows(self.texts, start, width, self.separator, self.line)
         self.lines, self.columns, self._faults = rows
         self.named, self.decimal = bool(self.names), ""
         if not self.named and width:
@@ -150,7 +150,7 @@ class TextTable:
         columns = [self.places.get((kind, who), -1) for kind in kinds]
         return [] if -1 in columns else columns
 
-    def position(self, axes: str = "", who: str = "") -> tuple[list[int], str]:
+    def position_columns(self, axes: str = "", who: str = "") -> tuple[list[int], str]:
         """Columns of a position, x, y and z or named by directions, and where they point: ``axes``, or ``"enu"``.
 
         Raises
@@ -182,7 +182,7 @@ class TextTable:
         codes = [known.setdefault(x, len(known)) for x in self.columns[column].tolist()]
         return np.array(codes, dtype=np.int64), [*known]
 
-    def numbers(self, which: Sequence[int], blank: Collection[int] = ()) -> Floats:
+    def numbers_of_columns(self, which: Sequence[int], blank: Collection[int] = ()) -> Floats:
         """Numbers (K, M) of some columns, all finite, in s, m and rad; of ``blank`` ones, empty fields and nan are NaN.
 
         A comma is a decimal mark if no number has a point, and not all are such that it may separate thousands.
@@ -236,7 +236,7 @@ def are_axes(axes: str) -> bool:
     return sorted(AXES.get(letter, (9,))[0] for letter in axes) == [0, 1, 2]
 
 
-def turn_of_axes(axes: str) -> Floats:
+def matrix_to_enu(axes: str) -> Floats:
     """The matrix (3, 3) from places along three directions to east, north, up."""
     turn = np.zeros((3, 3))
     for k, letter in enumerate(axes):
@@ -286,7 +286,7 @@ def _lines(data: bytes) -> list[str]:
     return text.split("\n")
 
 
-def _find_head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
+def _find_header(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     """Line of the names, number of lines before the rows, names, units in a row below them, separator, and width."""
     head = [k for k, line in enumerate(texts[:_HEAD]) if line.strip()]
     if long := next((k + 1 for k in head if len(texts[k]) > _LONGEST), 0):
@@ -350,7 +350,7 @@ def _count_fitting_rows(lines: list[str], width: int, separator: str) -> tuple[i
     return len(fine), Counter(fine).most_common(1)[0][0] if fine else 0
 
 
-def _rows(
+def _read_rows(
     texts: list[str], start: int, width: int, separator: str, names: int
 ) -> tuple[Ints, list[np.ndarray], list[Fault]]:
     """Lines of the rows, texts of the columns, and faults; read in blocks, as rows of texts take much memory."""

@@ -27,7 +27,7 @@ def to_toml(data: Mapping[str, Any]) -> str:
     return _NUMBERS.sub(lambda match: f"[{' '.join(match[1].split())[:-1]}]", text)
 
 
-def text_has_data(text: str, data: Mapping[str, Any]) -> bool:
+def toml_equals_data(text: str, data: Mapping[str, Any]) -> bool:
     """Whether a text is TOML, and says what data say."""
     try:
         return tomllib.loads(text) == data

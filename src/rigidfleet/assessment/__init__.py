@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rigidfleet.assessment.checks import all_checks
 from rigidfleet.assessment.measure import Measurements
-from rigidfleet.assessment.notes import notes
+from rigidfleet.assessment.notes import verdict_notes
 from rigidfleet.assessment.safety import Safety, safety
 from rigidfleet.assessment.verdict import Verdict
 from rigidfleet.result import Result, as_result
@@ -69,5 +69,5 @@ def assess(result: Result | str | Path) -> Verdict:
         read=[*result.statistics.get("read", [])],
     )  # fmt: skip
     verdict.checks.extend(all_checks(measured, phases))
-    verdict.notes.extend(notes(measured, phases))
+    verdict.notes.extend(verdict_notes(measured, phases))
     return verdict

@@ -69,7 +69,7 @@ class Alignment(NamedTuple):
         }  # fmt: skip
 
 
-def align(logs: Logs, plan: Plan, clock: str) -> Alignment:
+def fit_alignment(logs: Logs, plan: Plan, clock: str) -> Alignment:
     """The clock and the set-up of logs against a plan.
 
     ``clock``: "recorded", near that of the plan; "offset", anywhere; or "own", each log anywhere for itself
@@ -77,9 +77,9 @@ def align(logs: Logs, plan: Plan, clock: str) -> Alignment:
     logs = [(t[:: -(-len(t) // _MANY)], x[:: -(-len(t) // _MANY)]) for t, x in logs]
     start, apart = np.zeros(6), np.zeros(len(logs))
     if clock == "own":
-        apart[:] = [_nearest_offset([log], [way]) for log, way in zip(logs, plan, strict=True)]
+        apart[:] = [_best_clock_offset([log], [way]) for log, way in zip(logs, plan, strict=True)]
         logs = [(t - by, x) for (t, x), by in zip(logs, apart, strict=True)]
-    start[0] = _nearest_offset(logs, plan) if clock == "offset" else 0.0
+    start[0] = _best_clock_offset(logs, plan) if clock == "offset" else 0.0
     every = np.ones(6, dtype=np.bool_)
     whole, errors, left = _fit(logs, plan, start, every, _setup_at(logs, plan, start[0])[1])
     own = np.empty((2, len(logs)))
@@ -159,7 +159,7 @@ def _standard_errors(A: Floats, left: Floats, time: Floats) -> Floats:
     return _WIDER * np.sqrt(spread * (_PARTS - 1) / _PARTS)
 
 
-def _nearest_offset(logs: Logs, plan: Plan) -> float:
+def _best_clock_offset(logs: Logs, plan: Plan) -> float:
     """The offset on a grid at which shapes of ways agree best, whatever the set-up."""
     few = [(t[:: -(-len(t) // _FEW)], x[:: -(-len(t) // _FEW)]) for t, x in logs]
     begin, end = min(t[0] for t, _ in few), max(t[-1] for t, _ in few)

@@ -12,7 +12,7 @@ import numpy as np
 from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, quantity
 from rigidfleet._common.text import agent_names, percent
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
-from rigidfleet.assessment.avoidance import guarantee_check
+from rigidfleet.assessment.avoidance import guard_checks
 from rigidfleet.assessment.fits import is_rigid
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import (
@@ -40,8 +40,8 @@ _UNSEEN = 0.01
 def all_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     """All checks of a flight: whether it is complete and its record true, its ends of phases, its quantities."""
     yield _completeness_check(measured.result)
-    yield from _record_check(measured)
-    yield from _unsampled_checks(measured)
+    yield from _record_consistency_check(measured)
+    yield from _missing_sample_checks(measured)
     yield from _failures_or_nearest(
         [
             *_settling_checks(phases),
@@ -99,7 +99,7 @@ def _completeness_check(result: Result) -> CheckResult:
     return CheckResult("complete", False, words, when=end, phase=result.phases[-1].name)
 
 
-def _record_check(measured: Measurements) -> Iterator[CheckResult]:
+def _record_consistency_check(measured: Measurements) -> Iterator[CheckResult]:
     """Fail a record that contradicts itself: it has been altered and proves nothing."""
     contradictions = list(measured.contradictions())
     if contradictions:
@@ -109,7 +109,7 @@ def _record_check(measured: Measurements) -> Iterator[CheckResult]:
         yield CheckResult("record", False, words, when=when)
 
 
-def _unsampled_checks(measured: Measurements) -> Iterator[CheckResult]:
+def _missing_sample_checks(measured: Measurements) -> Iterator[CheckResult]:
     """Fail waypoints and ends of shaping phases that no sample is near: they cannot be judged."""
     from rigidfleet.mission import KINDS  # takes long to load, and the flight has loaded it
 
@@ -154,7 +154,7 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
         if not (shaping and p.finished) or p.formation is None:
             continue
         last = measured.parts[i].stop - 1
-        edges, _ = measured.edges(p.formation, last)
+        edges, _ = measured.edges_at_sample(p.formation, last)
         held = False
         if p.distances is not None:
             form = measured.mission.formations[p.formation]
@@ -163,9 +163,9 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
             words = f"{value(p.distances, 'm')} off (limit {value(limit, 'm')})"
             words = f"the worst of the {len(edges)} edges of '{p.formation}' is {words}"
             yield _check_at_end(p, "distances", held, words, p.distances, limit, "m")
-        if i not in measured.fits:
+        if i not in measured.fits_at_end:
             continue
-        fit = measured.fits[i]
+        fit = measured.fits_at_end[i]
         passed = fit.error <= fit.limit
         who = agent_names(fit.pair)
         words = (
@@ -340,7 +340,7 @@ def _clearance_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResu
     """Check the clearance in flight, and separately that of vehicles that stand on an obstacle at start or end."""
     if (least := measured.worst(q.name)) is None:
         return
-    apart = {name: e for name, e in measured.clearances().items() if e is not None}
+    apart = {name: e for name, e in measured.least_clearances().items() if e is not None}
     e = min([least, *apart.values()], key=lambda e: e.value)
     touch = max(_CONTACT, measured.result.statistics.get("touch", 0.0))  # of a log: its noise
     hit = e.value < -touch
@@ -512,5 +512,5 @@ _CHECKS: dict[str, Callable[[Measurements, Quantity], Iterator[CheckResult]]] = 
     "saturation": _saturation_check,
     "tilt": _tilt_check,
     "tracking_error": _tracking_check,
-    "guarantee": guarantee_check,
+    "guarantee": guard_checks,
 }

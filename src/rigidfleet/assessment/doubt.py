@@ -163,7 +163,7 @@ def verdict_with_doubt(
             check = replace(check, worst=None, first=None)  # noqa: PLW2901
         if deviations and not why and name not in (*_CERTAIN, *_UNSEEN):
             check = _with_interval(check, deviations.deviation_of(check), facts["noise_m"])  # noqa: PLW2901
-            check = _undecided_at_reset(check, resets)  # noqa: PLW2901
+            check = _leave_open_at_reset(check, resets)  # noqa: PLW2901
         elif why and check.judged and name not in _CERTAIN:
             words = f"{name.replace('_', ' ')} is not judged: {why}"
             check = replace(check, passed=False, undecided=True, message=words)  # noqa: PLW2901
@@ -201,7 +201,7 @@ def _with_interval(check: CheckResult, by: float, sigma: float) -> CheckResult:
     return replace(check, passed=False, undecided=True, message=f"{words}: undecided; {remedy}")
 
 
-def _undecided_at_reset(check: CheckResult, resets: list[float]) -> CheckResult:
+def _leave_open_at_reset(check: CheckResult, resets: list[float]) -> CheckResult:
     """A check, undecided if it is missed where an estimator sets its position anew: no vehicle flew that."""
     near = [t for t in resets if check.when is not None and abs(t - check.when) < _RESET]
     if check.passed or check.undecided or not near:

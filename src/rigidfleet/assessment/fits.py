@@ -59,7 +59,7 @@ class Fit(NamedTuple):
     in_order: bool | None
 
 
-def fits_of(
+def formation_fits(
     p: Floats, slots: Floats, who: Ints, greatest_error: Callable[[float], float]
 ) -> Iterator[Fit]:
     """Compare a formation as flown at G samples with its slots (N, 3): agents ``who`` (N,) at p (G, N, 3).

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, Quantity, quantity
-from rigidfleet.assessment.fits import Fit, angle_between, fits_of
+from rigidfleet.assessment.fits import Fit, angle_between, formation_fits
 from rigidfleet.assessment.verdict import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -20,10 +20,10 @@ from rigidfleet.result.quantities import (
     SAMPLED,
     Samples,
     closeness,
+    mask_lost,
     norms,
     owner_name,
     samples,
-    without_lost,
 )
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -68,7 +68,7 @@ class Measurements:
         return {q.name: self.samples_of(q.name) for q in QUANTITIES.values() if q.by_phase}
 
     @cached_property
-    def ranks(self) -> dict[tuple[str, int], float]:
+    def phase_ranks(self) -> dict[tuple[str, int], float]:
         """Greatest rank of each of these quantities at the samples of each phase that has samples."""
         starts, ranks = np.array([self.parts[k].start for k in self.flown]), {}
         for name, sampled in self.samples_by_name.items():
@@ -140,7 +140,7 @@ class Measurements:
         for name, sampled in self.samples_by_name.items():
             q, alone = sampled.quantity, name not in self.names_recorded
             for k, (phase, worst) in enumerate(zip(self.result.phases, every, strict=True)):
-                x, rank = phase.extremes.get(name), self.ranks.get((name, k), -math.inf)
+                x, rank = phase.extremes.get(name), self.phase_ranks.get((name, k), -math.inf)
                 if x is not None and rank < q.rank(_size(q, x)):
                     worst[name] = self.extreme_of(name, x, phase.name)
                 elif e := self.worst_sample(sampled, self.parts[k], alone=alone):
@@ -158,14 +158,14 @@ class Measurements:
         k = int(np.argmax(sampled.values <= 0.0))
         return self.worst_sample(sampled, slice(k, k + 1), alone=True) or e
 
-    def clearances(self) -> dict[str, Extreme | None]:
+    def least_clearances(self) -> dict[str, Extreme | None]:
         """Least clearance to obstacles [m] in flight, and of vehicles standing on one at the start or end.
 
         A vehicle stands on an obstacle below it while it has been within `PAD` of it since the start, or stays so to
         the end.
         """
         time = self.result.time
-        clearance, nearest = without_lost(self.result, self.closeness.each), self.closeness.nearest
+        clearance, nearest = mask_lost(self.result, self.closeness.each), self.closeness.nearest
         stands = (~(clearance[0] > PAD)).any() or (self.left[-1] & ~(clearance[-1] > PAD)).any()
         if not (stands or self.names_recorded & {"clearance_start", "clearance_end"}):
             # No vehicle ever stands on an obstacle.
@@ -184,12 +184,12 @@ class Measurements:
             "clearance_end": (k >= first) & (k > last) & ~beside,
         }
 
-        def owner(k: int, i: int) -> tuple[int, int]:
+        def agent_and_obstacle(k: int, i: int) -> tuple[int, int]:
             return i, int(nearest[k, i])
 
         return {
             name: self.worst_among(
-                name, Samples(quantity(name), np.where(part, clearance, np.nan), owner)
+                name, Samples(quantity(name), np.where(part, clearance, np.nan), agent_and_obstacle)
             )
             for name, part in parts.items()
         }
@@ -228,7 +228,7 @@ class Measurements:
                     words = f"it lacks the worst '{name}' of phase '{phase.name}' between samples"
                     yield words, float(time[part.start])
             for name, share in _SLACK.items():
-                x, rank = extremes.get(name), self.ranks.get((name, index), -math.inf)
+                x, rank = extremes.get(name), self.phase_ranks.get((name, index), -math.inf)
                 if x is None or rank == -math.inf:
                     continue
                 slack = rounding + share * abs(rank)
@@ -248,7 +248,7 @@ class Measurements:
         if name == "geofence":
             return self.mission.limits.geofence is not None
         if name != "clearance":
-            return self.ranks.get((name, index), -math.inf) > -math.inf
+            return self.phase_ranks.get((name, index), -math.inf) > -math.inf
         # An obstacle that is there at the start or the end of a phase alone is not in it.
         phase = self.result.phases[index]
         there = (thing.solid.there[0] for thing in self.mission.obstacles)
@@ -256,16 +256,16 @@ class Measurements:
 
     def phase_verdict(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
-        result, fit, waypoints = self.result, self.fits.get(index), self.waypoints
+        result, fit, waypoints = self.result, self.fits_at_end.get(index), self.waypoint_misses
         finished = index in self.flown and (result.complete or index < len(result.phases) - 1)
         return PhaseVerdict(
             **{key: getattr(record, key) for key in _OF_RECORD},
             finished=finished and not record.abandoned,
-            constraint=self.constraints.get(index),
-            distances=self.shapes[0].get(index),
+            constraint=self.constraint_errors_at_end.get(index),
+            distances=self.shape_errors_and_fits[0].get(index),
             shape=None if fit is None else fit.error,
             handedness=None if fit is None or fit.dimension < 3 else not fit.is_mirrored,
-            flip=self.flips.get(index),
+            flip=self.flip_angles.get(index),
             order=None if fit is None else fit.in_order,
             waypoint=waypoints.get((index, "target")),
             stay=waypoints.get((index, "stay")),
@@ -281,11 +281,11 @@ class Measurements:
         return [self.parts[k].stop - 1 for k in self.flown]
 
     @cached_property
-    def constraints(self) -> dict[int, float | None]:
+    def constraint_errors_at_end(self) -> dict[int, float | None]:
         """Greatest constraint error [m] of an edge at the end of each phase flown."""
-        return dict(zip(self.flown, _greatest(self.result.constraint[self.last]), strict=True))
+        return dict(zip(self.flown, _row_maxima(self.result.constraint[self.last]), strict=True))
 
-    def edges(self, formation: str, k: int) -> tuple[Ints, Floats]:
+    def edges_at_sample(self, formation: str, k: int) -> tuple[Ints, Floats]:
         """Edges (m, 2) of a formation that are not lost at sample k, and their lengths (m,) [m]."""
         mission = self.mission
         edges, intended = mission.formation_edges(formation), mission.formation_distances(formation)
@@ -294,7 +294,7 @@ class Measurements:
         return edges[kept], intended[kept]
 
     @cached_property
-    def shapes(self) -> tuple[dict[int, float | None], dict[int, Fit]]:
+    def shape_errors_and_fits(self) -> tuple[dict[int, float | None], dict[int, Fit]]:
         """Greatest errors [m] of edges against the formation at the end of each phase that has one, and its fits."""
         result, mission, errors, fits, groups = self.result, self.mission, {}, {}, {}
         links = (mission.links_lost[1] < result.time[self.last, None]).sum(axis=1).tolist()
@@ -306,25 +306,25 @@ class Measurements:
         for (name, *_, finite), ends in groups.items():
             phases, samples = zip(*ends, strict=True)
             r, left = result.position[[*samples]], np.flatnonzero(self.left[samples[0]])
-            edges, intended = self.edges(name, samples[0])
+            edges, intended = self.edges_at_sample(name, samples[0])
             off = proximity.lengths(r, edges).T - intended
-            errors.update(zip(phases, _greatest(off), strict=True))
+            errors.update(zip(phases, _row_maxima(off), strict=True))
             slots = mission.formation_slots(name)
             if slots is not None and len(left) > 1 and finite:
                 most = mission.formations[name].greatest_error
-                every = fits_of(r[:, left], slots[left], left, most)
+                every = formation_fits(r[:, left], slots[left], left, most)
                 fits.update(zip(phases, every, strict=True))
         return errors, fits
 
     @property
-    def fits(self) -> dict[int, Fit]:
+    def fits_at_end(self) -> dict[int, Fit]:
         """Fits of the formations at the end of each phase."""
-        return self.shapes[1]
+        return self.shape_errors_and_fits[1]
 
     @cached_property
-    def flips(self) -> dict[int, float | None]:
+    def flip_angles(self) -> dict[int, float | None]:
         """Angle [deg] of a line or plane from its intended direction at the end of each phase that has one."""
-        flat = {index: fit for index, fit in self.fits.items() if fit.dimension < 3}
+        flat = {index: fit for index, fit in self.fits_at_end.items() if fit.dimension < 3}
         if not flat:
             return {}
         samples = [self.parts[k].stop - 1 for k in flat]
@@ -349,7 +349,7 @@ class Measurements:
         return after if abs(time[after] - t) < abs(time[before] - t) else before
 
     @cached_property
-    def waypoints(self) -> dict[tuple[int, str], Waypoint]:
+    def waypoint_misses(self) -> dict[tuple[int, str], Waypoint]:
         """Misses of the "target" of each phase, of its place to "stay", and of the points to pass on the way.
 
         A target is due at its time, or at the end of a phase that settles earlier; of the others, those that the
@@ -391,7 +391,7 @@ def _size(q: Quantity, x: Extremum) -> float:
     return abs(x.value) if q.name == "constraint" else q.scale * x.value
 
 
-def _greatest(values: Floats) -> list[float | None]:
+def _row_maxima(values: Floats) -> list[float | None]:
     """Greatest finite size in each row of values (K, m); None if there is none."""
     sizes = np.where(np.isfinite(values), np.abs(values), -1.0).max(axis=1, initial=-1.0)
     return [None if size < 0.0 else size for size in sizes.tolist()]

@@ -19,7 +19,7 @@ _FAST, _WIDE = 100.0, 20_000.0
 _NAMED = 20
 
 
-def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
+def verdict_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     """Facts that fail no check but that a reader should know."""
     yield from _abandonment_notes(measured)
     yield from _below_zero_notes(measured)
@@ -43,7 +43,7 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     yield from avoidance_notes(measured)
     if "doubt" in measured.result.statistics:
         yield "a log is judged here as if it were exact; `assess MISSION LOG...` judges it with doubt"
-    yield from _samples_note(measured)
+    yield from _samples_alone_note(measured)
     yield from _foreign_flight_notes(measured)
 
 
@@ -110,7 +110,7 @@ def _abandonment_notes(measured: Measurements) -> Iterator[str]:
             yield f"'{record.name}' was left at {record.t_end:.2f} s, before its arrival, which is not judged"
 
 
-def _samples_note(measured: Measurements) -> Iterator[str]:
+def _samples_alone_note(measured: Measurements) -> Iterator[str]:
     """Note a record that does not say what happens between its samples."""
     if any(not measured.result.phases[k].extremes for k in measured.flown):
         step = float(np.diff(measured.result.time).max(initial=0.0))
@@ -154,7 +154,7 @@ def _turnover_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Itera
     """Note planar formations that turn over between phases while no attitude is commanded."""
     seen: dict[str, tuple[list[float], float]] = {}
     for i, p in enumerate(phases):
-        fit = measured.fits.get(i)
+        fit = measured.fits_at_end.get(i)
         if fit is None or p.formation is None or fit.dimension != 2 or p.flip is not None:
             continue
         if not p.finished or fit.error > fit.limit:

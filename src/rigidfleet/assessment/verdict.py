@@ -15,8 +15,8 @@ from rigidfleet._common.facts import (
     Sheet,
     Shown,
     table_of,
+    table_of_worst_values,
     value,
-    worst_values,
 )
 from rigidfleet._common.plain import to_json_data
 from rigidfleet._common.quantities import QUANTITIES, Quantity, quantity
@@ -304,9 +304,9 @@ class Verdict(Shown):
         Then the phases in which a user's controller was not called.
         """
         uncalled = f"\n{self.uncalled[0].upper()}{self.uncalled[1:]}." if self.uncalled else ""
-        return self._judgement() + uncalled
+        return self._verdict_in_words() + uncalled
 
-    def _judgement(self) -> str:
+    def _verdict_in_words(self) -> str:
         judged = [check for check in self.checks if check.judged]
         if self.word != "passed":
             some = self.failures or self.open_checks
@@ -373,7 +373,7 @@ class Verdict(Shown):
             _phase_table(self.phases),
             *([Line(meaning)] if has_edges else []),
             _waypoint_table(self.phases),
-            worst_values("check", checks),
+            table_of_worst_values("check", checks),
             *(Line(f"Note: {note}.", "note") for note in self.notes),
             Line(self.summary, _LEVELS[self.word]),
         ]

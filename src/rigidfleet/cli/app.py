@@ -84,7 +84,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         with run.raise_interrupts() if tokens is None else nullcontext():
             return app(tokens, console=console.out(), error_console=console.err()) or PASSED
     except (CycloptsError, RigidfleetError) as error:
-        console.print_error(_usage(error) if isinstance(error, CycloptsError) else error)
+        console.print_error(_usage_text(error) if isinstance(error, CycloptsError) else error)
         return BAD_INPUT
     except BrokenPipeError:
         console.discard_output(sys.stdout)
@@ -122,7 +122,7 @@ def _internal_error_message(error: Exception) -> str:
     )
 
 
-def _usage(error: CycloptsError) -> str:
+def _usage_text(error: CycloptsError) -> str:
     """Message for an invalid command line."""
     from rigidfleet._common.renamed import rename_hint
 

@@ -163,7 +163,7 @@ def assess(
         if origin is not None and not any("origin" in part for part in read.read):
             raise RigidfleetError("--origin: no file says where on the Earth it is; remove it")
         judged: dict[str, Any] = {} if plan else {
-            "mission": mission, "separation": separation, "limits": _limits(limits or []) | higher,
+            "mission": mission, "separation": separation, "limits": _parse_limits(limits or []) | higher,
             "radius": radius or 0.0, "ground": ground, "name": flight_name(files[0]),
         }  # fmt: skip
         doubts = _stated_doubts(noise, clock) if noise or plan else None
@@ -205,9 +205,9 @@ def _judge(
 
     if doubts is None:
         from rigidfleet.foreign.curves import looks_measured
-        from rigidfleet.simulation.trajectories import of_curves
+        from rigidfleet.simulation.trajectories import result_of_trajectories
 
-        result = of_curves(read, **judged)
+        result = result_of_trajectories(read, **judged)
         verdict = judge(result)
         if looks_measured(read.curves, read.assumed):
             verdict.notes.append(
@@ -248,7 +248,7 @@ def _stated_doubts(noise: str | None, clock: Literal["recorded", "offset", "own"
     return Doubts(size, more[0] if more else None, clock or "recorded")
 
 
-def _limits(limits: list[str]) -> dict[str, float]:
+def _parse_limits(limits: list[str]) -> dict[str, float]:
     """Limits of the command line by key.
 
     Raises

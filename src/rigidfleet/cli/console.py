@@ -170,7 +170,7 @@ class _Screen:
     def __str__(self) -> str:
         """Text on a terminal: progress, or what is waited for before there is any."""
         text = COMPILING if self.cold else "Starting"
-        return self._words() or f"{text}: {perf_counter() - self.begun:.0f} s"
+        return self._progress_text() or f"{text}: {perf_counter() - self.begun:.0f} s"
 
     def show_progress(self, total: float, done: float, now: float) -> None:
         """Show the progress; without animation as a line, if the last line was long ago."""
@@ -181,9 +181,9 @@ class _Screen:
                 self.progress.refresh()
         elif now - self.shown_at > _SELDOM:
             self.shown_at = now
-            self.console.print(self._words())
+            self.console.print(self._progress_text())
 
-    def _words(self) -> str:
+    def _progress_text(self) -> str:
         """Progress; nothing while it is waited for."""
         return ""
 
@@ -231,7 +231,7 @@ class FlightWatch(_Screen):
         self.heard = now
         self.show_progress(progress.t_end, progress.t, now)
 
-    def _words(self) -> str:
+    def _progress_text(self) -> str:
         """Mission time, speed relative to real time, time left, phase."""
         silence = perf_counter() - self.heard
         if not self.recent or (self.cold and silence > _SILENCE):
@@ -268,7 +268,7 @@ class SweepWatch(_Screen):
         if self.base is not None:
             self.show_progress(progress.runs, progress.done, perf_counter())
 
-    def _words(self) -> str:
+    def _progress_text(self) -> str:
         """Finished runs, rate, time left, failures, workers."""
         if self.base is None or self.last is None:
             return ""

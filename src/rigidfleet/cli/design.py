@@ -83,7 +83,7 @@ def design(
 
     refuse_overwriting(out, force=force)
     try:
-        name, (slots, colours, notes) = points_of(shape, agents, size, spacing, font)
+        name, (slots, colours, notes) = load_shape_points(shape, agents, size, spacing, font)
         kinds: dict[str, Any] = {}
         _refuse_options_that_clash(edges, reach, extra, sensing_range)
         if edges is None:
@@ -100,7 +100,7 @@ def design(
         text += designs.mission_fragment(name, slots, chosen, reach)
         if colours is not None:
             text += f"colour = {dumps(colours)}\n"
-        judged = {what: compare_graph(slots, graph) for what, graph in kinds.items()}
+        judged = {what: rigidity_of_graph(slots, graph) for what, graph in kinds.items()}
     except ValueError as error:
         words = str(error).rstrip(".")
         raise RigidfleetError(f"{shape}: {words}{'' if words.endswith('?') else '.'}") from None
@@ -159,7 +159,7 @@ def _refuse_options_that_clash(
         raise ValueError(f"--reach must be a positive number, not {reach:g}")
 
 
-def compare_graph(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[Any, ...]]:
+def rigidity_of_graph(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[Any, ...]]:
     """Rigidity of slots (N, 3) with a graph: as data, and as cells of a row of the table."""
     import numpy as np
 
@@ -184,7 +184,7 @@ def compare_graph(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[Any, ..
     return data, (f"{len(edges):,}", rank, index, condition, longest, kind)
 
 
-def points_of(
+def load_shape_points(
     shape: str,
     agents: int | None,
     size: list[float] | None = None,

@@ -56,10 +56,10 @@ def live(
         files.print_paths()
         return f"Saved in {files.result}."
 
-    def ready(url: str) -> None:
+    def announce_url(url: str) -> None:
         console.out().print(f"Flying {flown.name} at {url}", soft_wrap=True)
         console.err().print("To end the flight, press Ctrl-C or close its page")
 
     with raise_interrupts():
-        fly(flown, port=port, browser=not no_browser, ready=ready, landed=save_flight)
+        fly(flown, port=port, browser=not no_browser, ready=announce_url, landed=save_flight)
     return PASSED

@@ -84,7 +84,7 @@ def new(
     }  # fmt: skip
     options = {key: value for key, value in all_options.items() if value is not None}
     if not (options or quiet or json or show) and sys.stdin.isatty() and console.err().is_terminal:
-        name, options = _ask(name)
+        name, options = _ask_for_mission(name)
     file = Path(name or "mission")
     if not file.name:
         raise RigidfleetError(f"{file}: is a folder. Name a file.")
@@ -95,7 +95,7 @@ def new(
     try:
         if show:
             spacing = 2.0 if spacing is None else spacing
-            text = _show_text(file, options, formations or "sphere,helix", spacing)
+            text = _text_of_show(file, options, formations or "sphere,helix", spacing)
         elif formations is not None or spacing is not None:
             raise ValueError("--formations and --spacing are for a show: add --show")
         else:
@@ -117,7 +117,7 @@ def new(
     return PASSED
 
 
-def _show_text(file: Path, values: dict[str, Any], formations: str, spacing: float) -> str:
+def _text_of_show(file: Path, values: dict[str, Any], formations: str, spacing: float) -> str:
     """Text of a show; points in the folder of the mission are written by the name of their file.
 
     Raises
@@ -133,15 +133,15 @@ def _show_text(file: Path, values: dict[str, Any], formations: str, spacing: flo
     agents = values.pop("agents", None)
     words = [word.strip() for word in formations.split(",") if word.strip()]
     if agents is None:
-        counts = (len(points.slots) for word in words if (points := _file_points(word)))
+        counts = (len(points.slots) for word in words if (points := _points_of_file(word)))
         agents = next(counts, _SHOWN)
-    scenes = [_show_formation(file, word, agents, spacing) for word in words]
-    return show_draft.show_text(
+    scenes = [_formation_of_show(file, word, agents, spacing) for word in words]
+    return show_draft.show_mission_text(
         file.stem, scenes, agents=agents, spacing=spacing, file=str(file), **values
     )
 
 
-def _show_formation(file: Path, word: str, agents: int, spacing: float) -> Any:
+def _formation_of_show(file: Path, word: str, agents: int, spacing: float) -> Any:
     """A formation of a show of a shape, a file or words.
 
     Points of a whole file in the folder of the mission that are not too narrow are written by the name of the file.
@@ -151,7 +151,7 @@ def _show_formation(file: Path, word: str, agents: int, spacing: float) -> Any:
     ValueError
         It cannot be made.
     """
-    from rigidfleet.cli.design import points_of
+    from rigidfleet.cli.design import load_shape_points
     from rigidfleet.formation.shapes import SHAPES
     from rigidfleet.math import proximity
     from rigidfleet.mission import show_draft
@@ -159,14 +159,14 @@ def _show_formation(file: Path, word: str, agents: int, spacing: float) -> Any:
     if word in SHAPES:
         return show_draft.shape_scene(word, agents, spacing)
     folder, there, count = file.parent.resolve(), Path(word).resolve(), agents
-    if (own := _file_points(word)) is not None:
+    if (own := _points_of_file(word)) is not None:
         whole = not own.notes and len(own.slots) <= agents and there.is_relative_to(folder)
         if whole and spacing <= proximity.nearest(own.slots).min() < math.inf:
             source = there.relative_to(folder).as_posix()
             return show_draft.points_scene(Path(word).stem, own, source, by_name=True)
         count = min(agents, len(own.slots))
     try:
-        name, points = points_of(word, count, spacing=spacing)
+        name, points = load_shape_points(word, count, spacing=spacing)
     except ValueError as error:
         raise ValueError(f"{word}: {error}") from None
     for note in points.notes:
@@ -174,7 +174,7 @@ def _show_formation(file: Path, word: str, agents: int, spacing: float) -> Any:
     return show_draft.points_scene(name, points, word)
 
 
-def _file_points(word: str) -> Any:
+def _points_of_file(word: str) -> Any:
     """The `Points` of a file; None for a drawing, words, or what is no file."""
     from rigidfleet.formation.point_files import read_points
 
@@ -186,12 +186,12 @@ def _file_points(word: str) -> Any:
 _SHOWN = 100
 
 
-def _ask(name: str) -> tuple[str, dict[str, Any]]:
+def _ask_for_mission(name: str) -> tuple[str, dict[str, Any]]:
     """Ask for the name and the numbers of a new mission, one by one. An empty answer accepts the default."""
     from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
     from rigidfleet.mission import draft
 
-    def answer(question: str, offered: str, take: Callable[[str], Any]) -> Any:
+    def ask_until_valid(question: str, offered: str, take: Callable[[str], Any]) -> Any:
         while True:
             try:
                 reply = console.err().input(f"{question} [{offered}]: ", markup=False)
@@ -203,13 +203,13 @@ def _ask(name: str) -> tuple[str, dict[str, Any]]:
             except ValueError as error:
                 console.err().print(f"  {error}", style="yellow")
 
-    def positive(text: str) -> float:
+    def parse_positive(text: str) -> float:
         value = parse_number(text)
         if not value > 0:
             raise ValueError("Enter a positive number.")
         return value
 
-    def known(text: str) -> str:
+    def parse_shape(text: str) -> str:
         draft.shape_known(text)
         return text
 
@@ -217,22 +217,22 @@ def _ask(name: str) -> tuple[str, dict[str, Any]]:
         slots(shape, [1.0] * SHAPES[shape].sizes, parse_whole(text))
         return parse_whole(text)
 
-    def point(text: str) -> tuple[float, ...]:
+    def parse_point(text: str) -> tuple[float, ...]:
         values = tuple(map(parse_number, text.replace(",", " ").split()))
         if len(values) != 3:
             raise ValueError("Enter three numbers: x, y, z.")
         return values
 
-    name = name or answer("Name", "mission", str)
-    shape = answer(f"Shape ({', '.join(SHAPES)})", "triangle", known)
+    name = name or ask_until_valid("Name", "mission", str)
+    shape = ask_until_valid(f"Shape ({', '.join(SHAPES)})", "triangle", parse_shape)
     answers: dict[str, Any] = {"shape": shape}
     usual = draft.agents_for(shape)
     if len(SHAPES[shape].agents) > 1:
-        answers["agents"] = answer(f"Vehicles ({agents_taken(shape)})", str(usual), count)
-    answers["size"] = [answer("Edge length [m]", f"{draft.SIZE:g}", positive)]
-    answers["mass"] = answer("Mass of each [kg]", f"{draft.MASS:g}", positive)
+        answers["agents"] = ask_until_valid(f"Vehicles ({agents_taken(shape)})", str(usual), count)
+    answers["size"] = [ask_until_valid("Edge length [m]", f"{draft.SIZE:g}", parse_positive)]
+    answers["mass"] = ask_until_valid("Mass of each [kg]", f"{draft.MASS:g}", parse_positive)
     there = " ".join(f"{x:g}" for x in draft.WAYPOINT)
-    waypoint = answer("Fly to x y z [m]", there, point)
+    waypoint = ask_until_valid("Fly to x y z [m]", there, parse_point)
     if waypoint != draft.WAYPOINT:  # the default waypoint is higher for a large shape
         answers["waypoints"] = [waypoint]
     return name, answers

@@ -220,7 +220,7 @@ def _judging_mission(path: Path, separation: float | None, radius: float | None)
     """
     from rigidfleet.cli.assess import flight_name
     from rigidfleet.foreign.files import read_trajectories
-    from rigidfleet.simulation.trajectories import of_curves
+    from rigidfleet.simulation.trajectories import result_of_trajectories
 
     if path.suffix == ".nc":
         raise RigidfleetError(f"{path}: is the result of a flight. Drill its mission instead.")
@@ -229,6 +229,6 @@ def _judging_mission(path: Path, separation: float | None, radius: float | None)
             f"{path}: is no mission, and has no limits. Give --separation, the least distance [m]."
         )
     read = read_trajectories(path, spans="stand")
-    return of_curves(
+    return result_of_trajectories(
         read, separation=separation, radius=radius or 0.0, name=flight_name(path)
     ).mission

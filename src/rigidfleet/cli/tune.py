@@ -78,7 +78,7 @@ def tune(
         with show_progress(None if quiet else console.SweepWatch()) as progress:
             tuned = study(
                 loaded, folder, objective=objective, budget=budget, seeds=seeds, validation=validation,
-                seed=seed, margin_share=margin_share, assume=_keys_of_lines(assume or []),
+                seed=seed, margin_share=margin_share, assume=_parse_key_lines(assume or []),
                 workers=workers, replace=force, progress=progress,
             )  # fmt: skip
     except KeyboardInterrupt:
@@ -94,7 +94,7 @@ def tune(
     return PASSED
 
 
-def _keys_of_lines(lines: list[str]) -> dict[str, Any]:
+def _parse_key_lines(lines: list[str]) -> dict[str, Any]:
     """Keys of a mission, given as lines of TOML."""
     try:
         return tomllib.loads("\n".join(lines))

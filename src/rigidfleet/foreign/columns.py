@@ -18,7 +18,7 @@ from rigidfleet._common.tables import (
     are_axes,
     fault,
     is_number,
-    turn_of_axes,
+    matrix_to_enu,
 )
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.typing import Floats, Ints
@@ -72,7 +72,7 @@ class _Places(NamedTuple):
     quaternion: list[int]
 
 
-def units_of(units: str | None, axes: str | None) -> Units:
+def parse_units(units: str | None, axes: str | None) -> Units:
     """The words of a user: units such as ``"ms,mm,deg"``, in any order, and axes such as ``"ned"``.
 
     Raises
@@ -110,7 +110,7 @@ def parse_table(data: bytes, words: Units) -> tuple[TextTable, list[str]]:
         why = "has no names of columns that are understood" if bare else "is empty"
         raise fault(why, "Give a table with a line of names such as time_s,x_m,y_m,z_m")
     if not table.named:
-        turned = table.numbers(range(4, 8))
+        turned = table.numbers_of_columns(range(4, 8))
         unit = (np.abs(np.linalg.norm(turned, axis=1) - 1.0) < 0.01).all()
         if table.separator not in " \t" or not unit:
             remedy = "Begin with a line such as time_s,x_m,y_m,z_m"
@@ -129,17 +129,17 @@ def parse_table(data: bytes, words: Units) -> tuple[TextTable, list[str]]:
     return table, notes
 
 
-def _times(table: TextTable, notes: list[str]) -> tuple[Floats, int | None]:
+def _times_and_epoch(table: TextTable, notes: list[str]) -> tuple[Floats, int | None]:
     """Times (K,) [s], and the nanoseconds since 1970 from which they count; None if they are no dates."""
     if not (columns := table.find("time")):
         raise table.missing_error("time")
     fields = table.columns[columns[0]].tolist() or [""]
     number = is_number(fields[0])
     if not table.lines.size or (number and abs(float(fields[0].replace(",", "."))) < _DATES[0]):
-        return table.numbers(columns)[:, 0], None
+        return table.numbers_of_columns(columns)[:, 0], None
     ticks, _ = [], table.factor(columns[0])
     for line, field in zip(table.lines.tolist(), fields, strict=True):
-        if (tick := _seconds_in(field)) is None:
+        if (tick := _parse_seconds(field)) is None:
             why = f"the time {table.names[columns[0]]} is {field[:40] or 'empty'}, neither a finite number nor a date"
             raise fault(why, "Write one, such as 2026-05-01T12:00:00.5Z", line)
         ticks.append(tick)
@@ -159,7 +159,7 @@ def _times(table: TextTable, notes: list[str]) -> tuple[Floats, int | None]:
     return time + float(since), None
 
 
-def _seconds_in(field: str) -> Decimal | None:
+def _parse_seconds(field: str) -> Decimal | None:
     """A number, or a date as seconds since 1970."""
     if is_number(field):
         plain = Decimal(field.replace(",", "."))
@@ -183,10 +183,10 @@ def read_tracks(
         The table cannot be read, or does not say whose rows they are.
     """
     sets = _columns_of_vehicles(table, axes, notes)
-    time, since = _times(table, notes)
+    time, since = _times_and_epoch(table, notes)
     columns = [k for own in sets.values() for part in own[1:] for k in part]
     blank = {k for own in sets.values() for k in own.place}
-    values = dict(zip(columns, table.numbers(columns, blank).T, strict=True))
+    values = dict(zip(columns, table.numbers_of_columns(columns, blank).T, strict=True))
     if not len(time):
         raise fault("has names of columns, but no rows", "Is the file cut off?")
     stack = lambda part, rows: np.column_stack([values[k][rows] for k in part])  # noqa: E731
@@ -221,7 +221,7 @@ def read_tracks(
         tracks.append(Track(who, table.lines[rows], time[rows], *turned))
     named = table.kinds[main.place[0]].kind in DIRECTIONS
     said = "the option" if axes else "the file" if named else ""
-    notes += _doubts(table, tracks, axes=bool(said))
+    notes += _doubts_about_units(table, tracks, axes=bool(said))
     used = {*columns, *table.find("time"), *identity}
     return tracks, {
         "rows": len(time), "names_in_line": table.line, "separator": SEPARATORS[table.separator],
@@ -245,7 +245,7 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
     sets: dict[str, _Places] = {}
     loose: dict[str, dict[str, int]] = {}
     for who in dict.fromkeys(who for _, who in table.places):
-        place, turned = table.position(axes, who)
+        place, turned = table.position_columns(axes, who)
         kinds = ("vx", "vy", "vz"), ("yaw",), ("qx", "qy", "qz", "qw")
         if place:
             sets[who] = _Places(turned, place, *(table.find(*kind, who=who) for kind in kinds))
@@ -386,7 +386,7 @@ def _turn_to_enu(
     """Places, velocities (K, 3) and yaws (K,) in east, north, up; yaw turns from the first axis to the second."""
     if axes == "enu":
         return place, velocity, yaw
-    turn = turn_of_axes(axes)
+    turn = matrix_to_enu(axes)
     if yaw is not None:
         x, y, up = turn[:, :2] @ np.stack([np.cos(yaw), np.sin(yaw)])
         yaw = None if up.any() else np.arctan2(y, x)
@@ -419,7 +419,7 @@ def _yaw_unless_doubtful(
     return yaw
 
 
-def _doubts(table: TextTable, tracks: list[Track], *, axes: bool) -> Iterator[str]:
+def _doubts_about_units(table: TextTable, tracks: list[Track], *, axes: bool) -> Iterator[str]:
     """What is assumed of units, and what looks as if it had other units or axes."""
     place = np.concatenate([track.place for track in tracks])
     top, bottom = place[:, 2].max(), place[:, 2].min()

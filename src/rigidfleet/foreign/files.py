@@ -20,7 +20,7 @@ from rigidfleet._common.tables import ContentError, fault
 from rigidfleet._common.text import first_few
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign import logs, poses, shows, texts
-from rigidfleet.foreign.columns import Units, units_of
+from rigidfleet.foreign.columns import Units, parse_units
 from rigidfleet.foreign.curves import ASSUMED, Trajectories
 from rigidfleet.math.piecewise import Piecewise
 
@@ -105,7 +105,7 @@ def read_trajectories(
     if len(listed) > _FILES:
         raise TrajectoryError(f"{paths[0]}: {len(listed):,} files are more than {_FILES:,}.")
     left_out = [note for path in paths for note in _notes_on_unread_files(path, listed)]
-    topics, words = (topic,) if isinstance(topic, str) else tuple(topic), units_of(units, axes)
+    topics, words = (topic,) if isinstance(topic, str) else tuple(topic), parse_units(units, axes)
     sources, parts, several = [group[0] for group in listed], [], len(listed) > 1
     for group in listed:
         parts.append(_read_sequence(group, interpolation, words, topics, origin, several))
@@ -186,7 +186,7 @@ def _put_on_one_clock(parts: list[Trajectories], sources: list[Path]) -> list[Tr
         raise _error(sources[dates.index(None)], why, "Give all files one clock")
     since = [(date - min(dated)) / 1e9 if dated else 0.0 for date in dates]
     return [
-        part._replace(curves=tuple(curve.later(begin) for curve in part.curves))
+        part._replace(curves=tuple(curve.shift_time(begin) for curve in part.curves))
         for part, begin in zip(parts, since, strict=True)
     ]
 
@@ -255,13 +255,13 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
         One of them may be a further vehicle.
     """
     read = {p for group in listed for p in group}
-    inside = sorted(path.rglob("*"), key=logs.natural_key)
+    inside = sorted(path.rglob("*"), key=logs.natural_sort_key)
     rest = [p for p in inside if p.is_file() and p not in read]
     for p in rest:
         hidden = _may_have_trajectories(p) and not _is_hidden(p)
         if not hidden:
             with suppress(TrajectoryError):
-                hidden = bool(_read_file([p], "linear", units_of(None, None), (), None, False))
+                hidden = bool(_read_file([p], "linear", parse_units(None, None), (), None, False))
         if hidden:
             why = f"may be a further vehicle, but is not read beside {listed[0][0].name}"
             raise _error(p, why, "Give its path as well, or move it out of the folder")
@@ -271,16 +271,16 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
 
 def _visible_files(folder: Path) -> list[Path]:
     """What is in a folder, in order, and not hidden."""
-    return [p for p in sorted(folder.iterdir(), key=logs.natural_key) if not _is_hidden(p)]
+    return [p for p in sorted(folder.iterdir(), key=logs.natural_sort_key) if not _is_hidden(p)]
 
 
 def _may_have_trajectories(path: Path) -> bool:
     """Whether a file may have trajectories, by its name; of one named ``.bin``, by its content."""
     suffix = path.suffix.lower()
-    return suffix in _SUFFIXES or (suffix == ".bin" and _head_of(path).startswith(logs.BIN))
+    return suffix in _SUFFIXES or (suffix == ".bin" and _first_bytes_of(path).startswith(logs.BIN))
 
 
-def _head_of(path: Path) -> bytes:
+def _first_bytes_of(path: Path) -> bytes:
     """The first bytes of a file.
 
     Raises
@@ -320,7 +320,7 @@ def _read_file(
 ) -> Trajectories:  # fmt: skip
     """What is in one file of ``several``, or in the parts of a recording, by its content; see `read_trajectories`."""
     path = parts[0]
-    head, suffix, log = _head_of(path), path.suffix.lower(), None
+    head, suffix, log = _first_bytes_of(path), path.suffix.lower(), None
     for begin, why in _REFUSED.items():
         if head.startswith(begin):
             raise TrajectoryError(f"{path}: {why.format(path.name)}.")
@@ -340,7 +340,7 @@ def _read_file(
         if (units.words or units.axes) and "units" not in read.read[0]:
             raise fault("says its units and axes itself", "Remove --units and --axes")
         for who, curve in zip(read.names, read.curves, strict=True):
-            _refuse_far_numbers(who, curve)
+            _refuse_huge_numbers(who, curve)
     except OSError as error:
         raise TrajectoryError(f"{path}: {os_error_in_words(error, 'read', path)}") from error
     except ContentError as error:
@@ -357,7 +357,7 @@ def _content_of(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def _refuse_far_numbers(who: str, curve: Piecewise) -> None:
+def _refuse_huge_numbers(who: str, curve: Piecewise) -> None:
     """Refuse numbers with which no distance can be computed.
 
     Raises

@@ -189,7 +189,7 @@ def choose_channels(channels: Sequence[Channel], topics: Sequence[str]) -> list[
     return sorted(chosen, key=lambda c: [*FORMS].index(c.message))
 
 
-def natural_key(name: object) -> list[tuple[int, str]]:
+def natural_sort_key(name: object) -> list[tuple[int, str]]:
     """Names in the order of the numbers in them: 2 before 10."""
     parts = re.split(r"(\d+)", str(name))
     return [(int(x), "") if x.isdecimal() and len(x) < 19 else (-1, x) for x in parts]
@@ -211,7 +211,7 @@ def trajectories_of(
     tracks: dict[str, _Track] = {}
     notes = {note: [""] for note in log.notes}
     several |= len(log.vehicles) > 1
-    for who in sorted(log.vehicles, key=natural_key):
+    for who in sorted(log.vehicles, key=natural_sort_key):
         reasons: list[str] = []
         channels = choose_channels(log.vehicles[who], topics)
         unlike = lambda c: several and FORMS[c.message][0].frame == "ned" and c.reference is None  # noqa: E731

@@ -84,7 +84,7 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
     unread: dict[str, str] = {}
     notes: list[str] = []
     try:
-        for each in chain.from_iterable(_places(path, unread) for path in paths):
+        for each in chain.from_iterable(_read_positions(path, unread) for path in paths):
             topic, first, stamp, received, numbers = each
             own = rows.setdefault(topic, _Rows(*first, array("q"), array("q"), array("d")))
             own.stamps.append(stamp)
@@ -102,7 +102,7 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
     if unread and not rows:
         topic, why = next(iter(unread.items()))
         raise fault(f"{topic}: {why}")
-    channels = [_channel(topic, own) for topic, own in rows.items()]
+    channels = [_channel_of_rows(topic, own) for topic, own in rows.items()]
     chosen = choose_channels(channels, topics)
     undated = [c for c in chosen if not (rows[c.topic].layout or any(rows[c.topic].stamps))]
     if len(undated) < len(chosen):  # they have another clock, or nothing was sent yet
@@ -123,7 +123,7 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
     return Log({c.topic: [c] for c in chosen}, clock, None, tuple(notes))
 
 
-def _places(path: Path, unread: dict[str, str]) -> Iterator[_Place]:
+def _read_positions(path: Path, unread: dict[str, str]) -> Iterator[_Place]:
     """Each position in a file.
 
     Topics that seem to have some and cannot be read get a reason in ``unread``.
@@ -152,10 +152,10 @@ def _places(path: Path, unread: dict[str, str]) -> Iterator[_Place]:
                 from zstandard import ZstdDecompressor
 
                 data = ZstdDecompressor().decompress(data, _MESSAGE)  # noqa: PLW2901
-            layout = _layout(definition, data[1:2] == b"\1") if own else None
+            layout = _message_layout(definition, data[1:2] == b"\1") if own else None
             count[topic] += 1
             try:
-                for who, frame, stamp, numbers in _decode(kind, layout, data):
+                for who, frame, stamp, numbers in _decode_positions(kind, layout, data):
                     yield f"{topic}{who}", (kind, layout, frame), stamp, received, numbers
             except struct.error:
                 where = f"{topic}: message {count[topic]}"
@@ -202,7 +202,7 @@ def _records_of_mcap(path: Path) -> Iterator[tuple[str, str, str, str, bytes, in
 
 
 @lru_cache(100)
-def _layout(definition: str, little: bool) -> np.dtype[Any]:
+def _message_layout(definition: str, little: bool) -> np.dtype[Any]:
     """Where the fields of a message are after its first 4 bytes, if all have one size."""
     fields, at = dict[str, tuple[np.dtype[Any], int]](), 0
     line = r"(?m)^[ \t]*(\w+)(?:\[(\d+)\])?[ \t]+(\w+)[ \t]*(?:#.*)?$"
@@ -216,7 +216,7 @@ def _layout(definition: str, little: bool) -> np.dtype[Any]:
     return np.dtype({"names": [*fields], "formats": forms, "offsets": offsets, "itemsize": at})
 
 
-def _decode(
+def _decode_positions(
     kind: str, layout: np.dtype[Any] | None, data: bytes
 ) -> Iterator[tuple[str, str, int, Sequence[float]]]:
     """Body ("" if the topic is of one), frame, stamp [ns] or 0, and numbers of each position in a message."""
@@ -236,26 +236,26 @@ def _decode(
         at += size * len(values)
         return values
 
-    def text() -> str:
+    def unpack_text() -> str:
         nonlocal at
         (length,) = read("I")
         at += length
         return bytes(data[at - length : at - 1]).decode(errors="replace")
 
     for _ in range(*read("I") if kind == "TFMessage" else (1,)):
-        stamp, frame = read("i")[0] * _BILLION + read("I")[0], text()
+        stamp, frame = read("i")[0] * _BILLION + read("I")[0], unpack_text()
         if kind == "NamedPoseArray":
-            yield from ((f":{text()}", frame, stamp, read("7d")) for _ in range(*read("I")))
+            yield from ((f":{unpack_text()}", frame, stamp, read("7d")) for _ in range(*read("I")))
             return
         if kind == "NavSatFix":
             fixed = read("b")[0] >= 0 and read("H")
             yield "", frame, stamp, read("3d") if fixed else (math.nan,) * 3
             return
-        who = f":{text()}" if kind in ("TransformStamped", "TFMessage", "Odometry") else ""
+        who = f":{unpack_text()}" if kind in ("TransformStamped", "TFMessage", "Odometry") else ""
         yield who if kind != "Odometry" else "", frame, stamp, read(f"{_NUMBERS[kind]}d")
 
 
-def _channel(topic: str, rows: _Rows) -> Channel:
+def _channel_of_rows(topic: str, rows: _Rows) -> Channel:
     """Columns as forms of messages name them; velocities are turned into the frame of positions."""
     received, time = np.asarray(rows.received), np.asarray(rows.stamps)
     order = np.argsort(received, kind="stable")

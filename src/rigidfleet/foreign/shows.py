@@ -82,7 +82,7 @@ def _read_drones(archive: _Archive) -> Trajectories:
         if key not in known:
             way = _dereference(archive, trajectory, f"{where}: trajectory")
             turned = None if yaw is None else _dereference(archive, yaw, f"{where}: yawControl")
-            known[key] = _curve(way, turned, names[-1])
+            known[key] = _curve_of_drone(way, turned, names[-1])
         curves.append(known[key])
         room -= curves[-1].pieces.size
         if room < 0:
@@ -104,14 +104,14 @@ def _read_json(archive: _Archive, entry: str) -> Any:
         data = archive.read(entry) if size <= _ENTRY else b""
         memory = sum(data.count(x) * each for x, each in _BECOMES.items())
         if size <= _ENTRY and memory <= _MEMORY:
-            return json.loads(data, parse_constant=_refuse_constant)
+            return json.loads(data, parse_constant=_refuse_json_constant)
     except (ValueError, zlib.error) as error:
         raise fault(f"{entry}: is damaged ({error})", _AGAIN) from None
     more = f"{entry}: has {size >> 20:,} MiB, more than a show needs"
     raise fault(more, "Give each drone an entry of its own")
 
 
-def _refuse_constant(constant: str) -> float:
+def _refuse_json_constant(constant: str) -> float:
     raise ValueError(f"has {constant}, not a finite number")
 
 
@@ -141,7 +141,7 @@ def _dereference(archive: _Archive, value: Any, where: str) -> dict[str, Any]:
     return entered
 
 
-def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who: str) -> Piecewise:
+def _curve_of_drone(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who: str) -> Piecewise:
     points = _value_at(trajectory, "points", list, who)
     if not points:
         raise fault(f"{who}: its trajectory has no points")
@@ -150,8 +150,8 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who: str) -> 
     for place, point in zip(where, points, strict=True):
         if not isinstance(point, list) or len(point) < 2:
             raise fault(f"{place}: is not [time, [x, y, z], [control points]]")
-    time = _float_rows([p[0] for p in points], (), where)
-    ends = _float_rows([p[1] for p in points], (3,), where)
+    time = _parse_float_rows([p[0] for p in points], (), where)
+    ends = _parse_float_rows([p[1] for p in points], (3,), where)
     if len(points) == 1:
         points, time = [*points, [0, ends[0], []]], np.append(time, time + 1.0)
         ends, where = np.repeat(ends, 2, axis=0), where * 2
@@ -168,7 +168,7 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who: str) -> 
     for count in np.unique(counts):
         k = np.flatnonzero(counts == count)
         middle = [inner[i] or np.zeros((0, 3)) for i in k]
-        middle = _float_rows(middle, (count, 3), [where[i + 1] for i in k])
+        middle = _parse_float_rows(middle, (count, 3), [where[i + 1] for i in k])
         control = np.concatenate([ends[k, None], middle, ends[k + 1, None]], axis=1)
         unit = Piecewise.of_bernstein(np.arange(len(k) + 1.0), control.swapaxes(1, 2))
         h = np.diff(time)[k, None, None]
@@ -185,7 +185,7 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who: str) -> 
     return with_headings(curve, times, -np.radians(degrees))
 
 
-def _float_rows(values: list[Any], shape: tuple[int, ...], where: list[str]) -> Floats:
+def _parse_float_rows(values: list[Any], shape: tuple[int, ...], where: list[str]) -> Floats:
     """Finite numbers (K, ...) of values of one shape, read at once; one by one where one of them is wrong."""
     if not any(isinstance(value, str | bool) for value in values):
         with suppress(ContentError):

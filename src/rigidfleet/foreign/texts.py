@@ -73,7 +73,7 @@ def _curve_of_coefficients(table: TextTable) -> Piecewise:
     if missing := [kind for kind in due if not table.find(kind)]:
         remedy = "A table of polynomials has the columns duration, x^0 to x^7, y^0, z^0 and yaw^0 to yaw^7"
         raise fault(f"has no column, or two, for {missing[0]}", remedy, table.line)
-    rows = table.numbers(table.find(*due))
+    rows = table.numbers_of_columns(table.find(*due))
     bad = np.flatnonzero(~(rows[:, 0] > 0.0))
     if len(bad):
         why = f"the duration is {rows[bad[0], 0]:g} s"
@@ -86,11 +86,11 @@ def read_polynomial(data: bytes) -> list[Piecewise]:
     return [_curve_of_coefficients(TextTable(data, {}))]
 
 
-def read_table(data: bytes) -> list[Piecewise]:
+def read_result_table(data: bytes) -> list[Piecewise]:
     """The curves in a table of `Result.to_csv`: polynomials of degree 7 (yaw: 3) that meet all that it says."""
     axes = [f"{kind}{axis}" for kind in ("", "v", "a", "j") for axis in "xyz"]
     table = TextTable(data, {})
-    every = table.numbers(table.find("time", *axes, "yaw", "yaw_rate"))
+    every = table.numbers_of_columns(table.find("time", *axes, "yaw", "yaw_rate"))
     code, labels = table.codes(table.names.index("agent"))
     curves = []
     for agent in sorted(range(len(labels)), key=lambda k: int(labels[k])):

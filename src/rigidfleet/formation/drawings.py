@@ -59,8 +59,8 @@ class Drawing:
         sheet = "".join(x.text or "" for x in root.iter() if _tag(x) == "style")
         sheet = re.sub(r"/\*.*?\*/", "", sheet, flags=re.S)
         size = [_length(root.get("width", "300"), 300.0), _length(root.get("height", "150"), 150.0)]
-        size = _numbers(root.get("viewBox", f"0 0 {size[0]} {size[1]}"))[2:]
-        self._expand(root, size)
+        size = _numbers_in_text(root.get("viewBox", f"0 0 {size[0]} {size[1]}"))[2:]
+        self._expand_references(root, size)
         root.tag = _SPACE + "svg"
         style = ElementTree.Element(_SPACE + "style")
         style.text = re.sub(_BLOCKS, "", sheet)
@@ -73,9 +73,9 @@ class Drawing:
         page = svg.SVG.parse(io.StringIO(text), ppi=96, width=size[0], height=size[1])
         for element in page.elements():
             if isinstance(element, svg.Shape | svg.Text | svg.Image):
-                self._draw(element)
+                self._add_outlines(element)
 
-    def _expand(self, element: Any, size: Any, depth: int = 0) -> None:
+    def _expand_references(self, element: Any, size: Any, depth: int = 0) -> None:
         """Turn references and views into groups that hold what they show; ``size`` is that of the view around."""
         self._count += 1
         if self._count > _MOST or depth > _DEEP:
@@ -106,17 +106,17 @@ class Drawing:
             )
             move = f"translate({x},{y})"
             if tag == "svg":
-                box = _numbers(own.pop("viewBox", f"0 0 {w} {h}"))
+                box = _numbers_in_text(own.pop("viewBox", f"0 0 {w} {h}"))
                 fit = own.pop("preserveAspectRatio", None)
                 move, size = svg.Viewbox.viewbox_transform(x, y, w, h, *box, fit), box[2:]
             own["transform"] = f"{own.get('transform', '')} {move}"
         for child in list(element):
             if re.fullmatch(_DRAWN, _tag(child)):
-                self._expand(child, size, depth + 1)
+                self._expand_references(child, size, depth + 1)
             else:
                 element.remove(child)
 
-    def _draw(self, element: Any) -> None:
+    def _add_outlines(self, element: Any) -> None:
         """Add the outlines of a shape that is filled or stroked, and seen."""
         style = {"fill": "black", "stroke": "none"} | element.values
         if style.get("visibility") in ("hidden", "collapse") or _is_zero(style.get("opacity")):
@@ -152,7 +152,7 @@ def _tag(element: Any) -> str:
     return tag if space in ("", _SPACE[:-1]) else ""
 
 
-def _numbers(text: str) -> list[float]:
+def _numbers_in_text(text: str) -> list[float]:
     return [float(x) for x in re.findall(r"[^\s,]+", text)]
 
 

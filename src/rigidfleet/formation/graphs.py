@@ -87,7 +87,7 @@ def henneberg(points: ArrayLike) -> Ints:
     rank = np.empty(n, dtype=np.int64)
     rank[order] = np.arange(n)
     tree = KDTree(p)
-    edges = [_triangle_of(order)]
+    edges = [_edges_of_first_three(order)]
     for some in np.array_split(order[3:], max(1, n // 4000)):
         near = tree.query(p[some], k=min(n, 48))[1]
         later = rank[near] >= rank[some][:, None]
@@ -99,12 +99,12 @@ def henneberg(points: ArrayLike) -> Ints:
             d = ((p[before] - p[some[k]]) ** 2).sum(axis=1)
             few = before[np.argsort(d, kind="stable")[:12]]
             at[k] = np.append(few, np.full(12 - len(few), -1))
-        u, length = _directions(p, some, at)
+        u, length = _directions_to_neighbours(p, some, at)
         a, b, c = (u[:, _TRIPLES[:, k]] for k in range(3))
         volume = np.abs((a * np.cross(b, c)).sum(axis=2))
         # Among equally good triples, the one with the shortest edges.
         worth = volume.round(3) - 1e-6 * length[:, _TRIPLES].sum(axis=2) / length.max()
-        edges.append(_edges_to(some, at, _TRIPLES[worth.argmax(axis=1)]))
+        edges.append(_edges_to_triple(some, at, _TRIPLES[worth.argmax(axis=1)]))
     return np.sort(np.concatenate(edges), axis=1).astype(np.int64)
 
 
@@ -131,29 +131,29 @@ def henneberg_multilevel(points: ArrayLike) -> Ints:
     first = farthest_points(p, min(n, 12), int(away.argmax()))
     order = _order_from_coarse_to_fine(p)
     order = _put_spanning_points_first(p, np.concatenate([first, order[~np.isin(order, first)]]))
-    edges, soft, done = [_triangle_of(order)], np.zeros(n), 3
+    edges, soft, done = [_edges_of_first_three(order)], np.zeros(n), 3
     while done < n:
         some = order[done : 2 * done if done >= 12 else done + 1]
         near = KDTree(p[order[:done]]).query(p[some], k=min(done, 12))[1]
         at = np.pad(order[near], ((0, 0), (0, 12 - near.shape[1])), constant_values=-1)
-        square = _softness(p, some, at, soft)
+        square = _softness_by_triple(p, some, at, soft)
         # All near points lie in one plane with it
         flat = np.flatnonzero(square.min(axis=1) > _FLAT)
         if len(flat):
             at[flat] = first[np.arange(12) % len(first)]
-            square[flat] = _softness(p, some[flat], at[flat], soft)
+            square[flat] = _softness_by_triple(p, some[flat], at[flat], soft)
         soft[some] = square.min(axis=1)
-        edges.append(_edges_to(some, at, _TRIPLES[square.argmin(axis=1)]))
+        edges.append(_edges_to_triple(some, at, _TRIPLES[square.argmin(axis=1)]))
         done += len(some)
     return np.sort(np.concatenate(edges), axis=1).astype(np.int64)
 
 
-def _softness(p: Floats, some: Ints, at: Ints, soft: Floats) -> Floats:
+def _softness_by_triple(p: Floats, some: Ints, at: Ints, soft: Floats) -> Floats:
     """Softness (k, 220) of points (k,) joined to each triple of those at (k, 12), which have the softness ``soft``.
 
     Triples that lie in a plane with the point, or are incomplete, give about 1e18.
     """
-    u, _ = _directions(p, some, at)
+    u, _ = _directions_to_neighbours(p, some, at)
     a, b, c = (u[:, _TRIPLES[:, k]] for k in range(3))
     rows = np.cross(b, c), np.cross(c, a), np.cross(a, b)
     volume = (a * rows[0]).sum(axis=2)
@@ -170,11 +170,11 @@ _FLAT = 1e12
 _TRIPLES = np.array(list(combinations(range(12), 3)))
 
 
-def _triangle_of(order: Ints) -> Ints:
+def _edges_of_first_three(order: Ints) -> Ints:
     return np.array([order[[0, 1]], order[[0, 2]], order[[1, 2]]])
 
 
-def _directions(p: Floats, some: Ints, at: Ints) -> tuple[Floats, Floats]:
+def _directions_to_neighbours(p: Floats, some: Ints, at: Ints) -> tuple[Floats, Floats]:
     """Unit vectors (k, 12, 3) and distances from points (k,) to others (k, 12); 0 for -1, which means none."""
     x = p[at] - p[some][:, None]
     length = np.linalg.norm(x, axis=2)
@@ -182,7 +182,7 @@ def _directions(p: Floats, some: Ints, at: Ints) -> tuple[Floats, Floats]:
     return np.where(there[..., None], x / np.maximum(length, 1e-300)[..., None], 0.0), length
 
 
-def _edges_to(some: Ints, at: Ints, triple: Ints) -> Ints:
+def _edges_to_triple(some: Ints, at: Ints, triple: Ints) -> Ints:
     """Edges (3k, 2) of points (k,) to three (k, 3) of those ``at`` (k, 12)."""
     return np.column_stack([np.repeat(some, 3), np.take_along_axis(at, triple, 1).ravel()])
 

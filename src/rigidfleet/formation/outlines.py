@@ -51,7 +51,7 @@ def svg_outlines(path: str | Path, notes: list[str] | None = None) -> list[Float
         raise ValueError("; ".join(["has no outline", *said]))
     if notes is not None:
         notes += said
-    return _drop_points([x * (1.0, -1.0) for x in drawing.outlines])
+    return _drop_degenerate_outlines([x * (1.0, -1.0) for x in drawing.outlines])
 
 
 def text_outlines(words: str, font: str = "DejaVu Sans") -> list[Floats]:
@@ -72,7 +72,7 @@ def text_outlines(words: str, font: str = "DejaVu Sans") -> list[Floats]:
     if not words.strip():
         raise ValueError("has no outline")
     path = TextPath((0.0, 0.0), words, size=1.0, prop=FontProperties(family=font))
-    return _drop_points([np.array(x) for x in path.to_polygons(closed_only=False)])
+    return _drop_degenerate_outlines([np.array(x) for x in path.to_polygons(closed_only=False)])
 
 
 def stroke_outlines(words: str, font: str = "futural") -> list[Floats]:
@@ -96,10 +96,10 @@ def stroke_outlines(words: str, font: str = "futural") -> list[Floats]:
     if missing := "".join(x for x in words if x not in letters.all_glyphs):
         raise ValueError(f"has letters that {font!r} lacks: {missing}")
     strokes = map(list, letters.strokes_for_text(words))
-    return _drop_points([np.array(x, dtype=np.float64) for x in strokes])
+    return _drop_degenerate_outlines([np.array(x, dtype=np.float64) for x in strokes])
 
 
-def _drop_points(outlines: list[Floats]) -> list[Floats]:
+def _drop_degenerate_outlines(outlines: list[Floats]) -> list[Floats]:
     finite = (x for x in outlines if len(x) > 1 and np.isfinite(x).all())
     if not (extended := [x for x in finite if np.ptp(x, axis=0).any()]):
         raise ValueError("has no outline")

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet._common.names import meaning_of
-from rigidfleet._common.tables import ContentError, Fault, TextTable, fault, turn_of_axes
+from rigidfleet._common.tables import ContentError, Fault, TextTable, fault, matrix_to_enu
 from rigidfleet._common.text import first_few
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.typing import Floats, Ints
@@ -82,7 +82,7 @@ def parse_points(data: bytes, name: str, *, repeated: bool = False) -> Points:
             lines, points, colours, notes = _read_table(data)
             place = "line"
     except ContentError as error:
-        raise MissionError(_findings(error.faults, name)) from None
+        raise MissionError(_findings_of_faults(error.faults, name)) from None
     except ValueError as error:
         remedy = "write it again, with one agent per row: x, y, z [m]"
         raise MissionError([Finding(name, "", None, str(error), remedy)]) from None
@@ -106,7 +106,7 @@ def parse_points(data: bytes, name: str, *, repeated: bool = False) -> Points:
             faults.append(Fault(int(lines[k]), f"{points[k].tolist()}", problem, remedy))
         if faults or not keys:
             faults = faults or [Fault(0, "", "has no points", "write one agent per row: x, y, z")]
-            raise MissionError(_findings(faults, name, place))
+            raise MissionError(_findings_of_faults(faults, name, place))
     return Points(points, colours, notes)
 
 
@@ -120,7 +120,7 @@ def csv_of_points(slots: Floats, colours: Sequence[str] | None) -> str:
     return "\n".join(["x,y,z,red,green,blue", *coloured, ""])
 
 
-def _findings(faults: Sequence[Fault], name: str, place: str = "line") -> list[Finding]:
+def _findings_of_faults(faults: Sequence[Fault], name: str, place: str = "line") -> list[Finding]:
     """Faults as findings, and how many more there are."""
     findings = [
         Finding(name, f"{place} {line}" if line else "", text or None, problem, remedy)
@@ -168,7 +168,7 @@ def _read_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tupl
     if bare and re.search(rb"(^|,)\s*-?0\d", data, re.MULTILINE):
         remedy = "if commas are decimal marks, separate numbers by semicolons"
         raise fault("has numbers such as 00", remedy)
-    columns, axes = table.position()
+    columns, axes = table.position_columns()
     if not (columns := columns or table.find("x", "y")):
         raise table.missing_error("x", "y")
     if (time := table.find("time")) and len(table.codes(time[0])[1]) > 1:
@@ -176,10 +176,10 @@ def _read_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tupl
         raise fault("has points of several times", remedy)
     written, n = table.find("colour"), len(columns)
     hues = table.find(*_HUES) if not written else []
-    values = table.numbers(columns + hues)
+    values = table.numbers_of_columns(columns + hues)
     if table.decimal == "," and not table.named:
         notes.append("commas are read as decimal marks")
-    points, colours = values[:, :n] @ turn_of_axes(axes)[:, :n].T, None
+    points, colours = values[:, :n] @ matrix_to_enu(axes)[:, :n].T, None
     known = {*columns, *hues, *written, *time}
     unread = [repr(name) for k, name in enumerate(table.names) if name and k not in known
               and table.kinds[k].kind not in ("agent", "thing")]  # fmt: skip

@@ -12,7 +12,7 @@ from rigidfleet.typing import Floats
 _AWAY = 2.0
 
 
-def places_beside(slots: ArrayLike, count: int) -> Floats:
+def rest_places_beside(slots: ArrayLike, count: int) -> Floats:
     """Places (count, 3) [m] in two blocks left and right of slots (K, 3), along x, as far apart as the nearest slots.
 
     Each place on the right has one on the left, mirrored at the middle of the slots, so that the middle stays where it
@@ -29,7 +29,7 @@ def places_beside(slots: ArrayLike, count: int) -> Floats:
     middle = p.mean(axis=0)
     off, step = p - middle, float(proximity.nearest(p).min())
     pairs = (count + 1) // 2
-    rows = [_symmetric_steps(off[:, axis], step) for axis in (1, 2)]
+    rows = [_symmetric_places(off[:, axis], step) for axis in (1, 2)]
     y, z = (x.ravel() for x in np.meshgrid(*rows, indexing="ij"))
     columns = -(-pairs // len(y))
     x = np.abs(off[:, 0]).max() + step * (_AWAY + np.arange(columns))
@@ -40,7 +40,7 @@ def places_beside(slots: ArrayLike, count: int) -> Floats:
     return middle + np.stack([right, -right], axis=1).reshape(-1, 3)[:count]
 
 
-def _symmetric_steps(along: Floats, step: float) -> Floats:
+def _symmetric_places(along: Floats, step: float) -> Floats:
     """Places a step apart over the extent of points, about zero, of which each is mirrored by one."""
     half = np.floor(np.ptp(along) / (2.0 * step) + 1e-9)
     return step * np.arange(-half, half + 1)

@@ -74,11 +74,11 @@ def _sphere(size: Floats, n: int) -> Floats:
 def _shells(size: Floats, n: int) -> Floats:
     """Two concentric spheres, the outer one first; their distance is that of neighbours on each sphere."""
 
-    def radius(count: int) -> float:
+    def sphere_radius(count: int) -> float:
         return float(np.linalg.norm(_sphere(size, count)[0]))
 
     def distance_of_neighbours(outer: int) -> float:
-        return radius(outer) - radius(n - outer)
+        return sphere_radius(outer) - sphere_radius(n - outer)
 
     numbers = range(n // 2 + 1, n - 3)  # of agents of the outer sphere
     outer = n // 2 + 1 + bisect_left(numbers, size[0], key=distance_of_neighbours)

@@ -71,7 +71,7 @@ def _write_table(motion: ExportedMotion, rate: float | None, first: int = 1) -> 
     yield csv_text(motion.at_rate(rate), first).encode()
 
 
-def _write_tables(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
+def _write_vehicle_tables(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     """Such a table for each vehicle."""
     for i in range(motion.n_agents):
         yield from _write_table(motion.of_vehicle(i), rate, i + 1)
@@ -79,7 +79,7 @@ def _write_tables(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]
 
 FORMATS: dict[str, Format] = {
     "setpoints": Format(
-        _write_table, texts.read_table, "csv", False, None,
+        _write_table, texts.read_result_table, "csv", False, None,
         "position, velocity, acceleration, jerk, yaw and yaw rate", "tilt and rotors", False,
     ),
     "polynomial": Format(
@@ -199,7 +199,7 @@ def export(
     result, path = as_result(result), as_path(path)
     chosen = format_of(format)
     if format == "setpoints" and path.suffix != ".csv":
-        chosen = chosen._replace(write=_write_tables, each=True)
+        chosen = chosen._replace(write=_write_vehicle_tables, each=True)
     setting = _rate_or_tolerance(format, chosen, rate, tolerance)
     if chosen.package and find_spec(chosen.package) is None:
         raise ResultError(
@@ -258,12 +258,12 @@ def _write_and_measure(
     deviations: list[Deviation] = []
     sizes: list[int] = []
 
-    def files() -> Iterator[bytes]:
+    def files_while_measuring() -> Iterator[bytes]:
         start = motion.start if chosen.own_time else 0.0
         sources = zip(motion.curves(), motion.result.motors_off, strict=True)
         for data in chosen.write(motion, setting):
             ways = zip(chosen.read(data), sources, strict=False)
-            own = [deviation(source, way.later(start), until) for way, (source, until) in ways]
+            own = [deviation(source, way.shift_time(start), until) for way, (source, until) in ways]
             worst = max(x.position for x in own)
             if chosen.tolerance is not None and setting is not None and worst > _SLACK * setting:
                 raise ResultError(
@@ -275,14 +275,14 @@ def _write_and_measure(
             yield data
 
     if not chosen.each:
-        write_file(path, next(files()))
+        write_file(path, next(files_while_measuring()))
     else:
         if path.suffix == f".{chosen.suffix}":
             raise ResultError(f"{path}: each vehicle has a file of its own. Give a folder.")
         width = len(str(motion.n_agents))
         ours = re.compile(rf"agent-\d+\.{chosen.suffix}")
         with replace_folder_atomically(path, ours) as folder:
-            for number, data in enumerate(files(), 1):
+            for number, data in enumerate(files_while_measuring(), 1):
                 name = f"agent-{number:0{width}}.{chosen.suffix}"
                 (folder / name).write_bytes(data)
     greatest = Deviation(*(float(np.max(x)) for x in zip(*deviations, strict=True)))

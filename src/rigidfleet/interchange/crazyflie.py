@@ -65,7 +65,7 @@ def _refuse_beyond_memory(
 def write_polynomial(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """A table for each vehicle: duration [s], and 8 coefficients of x, y, z [m] and yaw [rad] of each piece."""
     row = ",".join(["%.9g"] * (1 + len(NAMES) * POWERS))
-    for curve in fit_curves(motion.chunks(), tolerance):
+    for curve in fit_curves(motion.curve_chunks(), tolerance):
         lines = [row % tuple(numbers) for numbers in curve_to_rows(curve)]
         yield "\n".join([_HEADER, *lines, ""]).encode()
 
@@ -79,7 +79,7 @@ def write_poly4d(motion: ExportedMotion, tolerance: float) -> Iterator[_Image]:
     ResultError
         The flight needs more than `PIECES` pieces.
     """
-    for curve in fit_curves(motion.chunks(), tolerance):
+    for curve in fit_curves(motion.curve_chunks(), tolerance):
         rows, after = np.roll(curve_to_rows(curve), -1, axis=1), curve.time - curve.time[0]
         needed = f"{len(rows)} pieces of {_POLY4D} bytes, and the memory has room for {PIECES}"
         ends = [(_POLY4D * k, t) for k, t in enumerate(after.tolist()) if k]
@@ -109,7 +109,7 @@ def write_compressed(motion: ExportedMotion, tolerance: float) -> Iterator[_Imag
         )
     # Times are whole milliseconds.
     near, turned = tolerance - COMPRESSED_ROUNDING, YAW_TOLERANCE - _TENTH
-    ways = (way.refine(np.round(way.time / _MS) * _MS) for way in motion.chunks())
+    ways = (way.refine(np.round(way.time / _MS) * _MS) for way in motion.curve_chunks())
     curves = fit_curves(ways, near, yaw_tolerance=turned, longest=_LONGEST * _MS)
     for number, curve in enumerate(curves, 1):
         yield _compressed_image(curve, number)

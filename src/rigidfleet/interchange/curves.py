@@ -12,7 +12,7 @@ from rigidfleet.errors import ResultError
 from rigidfleet.math import series
 from rigidfleet.math.piecewise import Piecewise, hermite_pieces, pad
 from rigidfleet.result import Result
-from rigidfleet.setpoints import Setpoints, at_rate, ways_of
+from rigidfleet.setpoints import Setpoints, setpoints_at_rate, ways_of
 from rigidfleet.typing import Floats, Ints
 
 #: Tolerance of yaw [rad] of exported curves. Position does not depend on it.
@@ -60,9 +60,9 @@ class ExportedMotion:
 
     def at_rate(self, rate: float | None) -> Setpoints:
         """Setpoints at a rate [Hz]; without one, the samples."""
-        return at_rate(self.samples, rate)
+        return setpoints_at_rate(self.samples, rate)
 
-    def chunks(self) -> Iterator[Piecewise]:
+    def curve_chunks(self) -> Iterator[Piecewise]:
         """The ways (K, n, 4, 8) of all vehicles in order, some at a time: degree 7 (yaw: 3) between samples."""
         n = 1 + _TOGETHER // (32 * len(self.samples.time))
         for first in range(0, self.n_agents, n):
@@ -70,7 +70,7 @@ class ExportedMotion:
 
     def curves(self) -> Iterator[Piecewise]:
         """The way (K, 4, 8) of each vehicle."""
-        for some in self.chunks():
+        for some in self.curve_chunks():
             for i in range(some.pieces.shape[1]):
                 yield Piecewise(some.time, some.pieces[:, i])
 
@@ -90,15 +90,15 @@ def fit_curves(
         Not even a piece between two samples is within the tolerance.
     """
     for some in ways:
-        yield from _fit_together(some, tolerance, orders, yaw_tolerance, longest)
+        yield from _fit_curves_together(some, tolerance, orders, yaw_tolerance, longest)
 
 
-def _fit_together(
+def _fit_curves_together(
     source: Piecewise, tolerance: float, orders: int, yaw_tolerance: float, longest: float
 ) -> Iterator[Piecewise]:
     """`fit_curves` of ways (K, N, 4, P): in each round, every vehicle tries a piece of its own length."""
     time, (n, vehicles) = source.time, source.pieces.shape[:2]
-    begin, end = source.ends(orders)
+    begin, end = source.states_at_ends(orders)
     t = time[:-1] + np.diff(time) * _CHECKED[:, None]
     # Points are the last axis: arithmetic on long rows is fast.
     wanted = source.at_shares(_CHECKED).transpose(3, 1, 2, 0).reshape(4, len(_CHECKED), -1)
@@ -155,8 +155,8 @@ def _fit_together(
 
 def cubic_curves(motion: ExportedMotion, tolerance: float) -> Iterator[Piecewise]:
     """For each vehicle its way in cubic pieces, from time zero on; see `heading_knots`."""
-    for curve in fit_curves(motion.chunks(), tolerance, 2, YAW_TOLERANCE / 2):
-        yield curve.later(-motion.start)
+    for curve in fit_curves(motion.curve_chunks(), tolerance, 2, YAW_TOLERANCE / 2):
+        yield curve.shift_time(-motion.start)
 
 
 def heading_knots(curve: Piecewise) -> tuple[Floats, Floats]:

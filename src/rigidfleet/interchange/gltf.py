@@ -39,7 +39,7 @@ class _File:
     def __init__(self) -> None:
         self.data, self.views, self.accessors = bytearray(), [], []
 
-    def add(self, x: Floats | Ints, dtype: str = "<f4", *, bounds: bool = False) -> int:
+    def add_array(self, x: Floats | Ints, dtype: str = "<f4", *, bounds: bool = False) -> int:
         """Add an array (K,) or (K, n) and return its number."""
         values = np.asarray(x, dtype=dtype)
         self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": values.nbytes})
@@ -65,8 +65,8 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """
     file = _File()
     mesh = {
-        "attributes": {"POSITION": file.add(_CORNERS, bounds=True)},
-        "indices": file.add(_FACES.ravel(), "<u4"),
+        "attributes": {"POSITION": file.add_array(_CORNERS, bounds=True)},
+        "indices": file.add_array(_FACES.ravel(), "<u4"),
     }
     nodes, samplers, channels = [], [], []
     radii = motion.result.mission.fleet.radius.tolist()
@@ -77,7 +77,7 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
             ("translation", curve.time, _spline_rows(curve), "CUBICSPLINE"),
             ("rotation", times, turned, "LINEAR"),
         ):
-            keys = {"input": file.add(time, bounds=True), "output": file.add(values)}
+            keys = {"input": file.add_array(time, bounds=True), "output": file.add_array(values)}
             samplers.append(keys | {"interpolation": way})
             channels.append({"sampler": len(samplers) - 1, "target": {"node": agent, "path": path}})
         nodes.append(
@@ -122,10 +122,10 @@ def _add_lights(scene: dict[str, Any], file: _File, motion: ExportedMotion) -> N
     scene["materials"] = [black | {"emissiveFactor": colour} for colour in colours]
     (shape,) = scene["meshes"][0]["primitives"]
     scene["meshes"] = [{"primitives": [shape | {"material": i}]} for i in range(n)]
-    keys = file.add(times - motion.start, bounds=True)
+    keys = file.add_array(times - motion.start, bounds=True)
     for i, node in enumerate(scene["nodes"]):
         node["mesh"] = i
-        animation["samplers"].append({"input": keys, "output": file.add(shown[:, i])})
+        animation["samplers"].append({"input": keys, "output": file.add_array(shown[:, i])})
         pointer = {_POINTER: {"pointer": f"/materials/{i}/emissiveFactor"}}
         target = {"path": "pointer", "extensions": pointer}
         animation["channels"].append({"sampler": len(animation["samplers"]) - 1, "target": target})
@@ -136,7 +136,7 @@ def _add_lights(scene: dict[str, Any], file: _File, motion: ExportedMotion) -> N
     ahead = np.array([right[1], -right[0], 0.0])
     back = np.cos(elevation) * ahead + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
     axes = np.stack([right, np.cross(back, right), back, (low + high) / 2 + far * back])
-    matrix = np.column_stack([_y_up(axes), [0.0, 0.0, 0.0, 1.0]]).ravel().tolist()
+    matrix = np.column_stack([_z_up_to_y_up(axes), [0.0, 0.0, 0.0, 1.0]]).ravel().tolist()
     seen = {"yfov": _FOV, "znear": 0.01 * far, "zfar": 10 * far}
     scene["cameras"] = [{"type": "perspective", "perspective": seen}]
     scene["nodes"].append({"name": "front", "camera": 0, "matrix": matrix})
@@ -164,7 +164,7 @@ def read_gltf(data: bytes) -> list[Piecewise]:
             [array(animation["samplers"][channel["sampler"]][key]) for key in ("input", "output")]
             for channel in (moved, turned)
         )
-        before, at, after = (_y_down(x) for x in values.reshape(-1, 3, 3).swapaxes(0, 1))
+        before, at, after = (_y_up_to_z_up(x) for x in values.reshape(-1, 3, 3).swapaxes(0, 1))
         begin, end = np.stack([at[:-1], after[:-1]]), np.stack([at[1:], before[1:]])
         yaw = np.unwrap(2.0 * np.arctan2(quaternions[:, 1], quaternions[:, 3]))
         way = Piecewise.of_ends(time[:, 0], begin, end)
@@ -174,15 +174,15 @@ def read_gltf(data: bytes) -> list[Piecewise]:
 
 def _spline_rows(curve: Piecewise) -> Floats:
     """Rows (3 K, 3) of a cubic spline: for each key the velocity before, the position and the velocity after."""
-    begin, end = (x[..., :3].swapaxes(0, 1) for x in curve.ends(2))
+    begin, end = (x[..., :3].swapaxes(0, 1) for x in curve.states_at_ends(2))
     rows = np.zeros((len(curve.time), 3, 3))
     rows[1:, :2], rows[:-1, 1:] = end[:, ::-1], begin
-    return _y_up(rows.reshape(-1, 3))
+    return _z_up_to_y_up(rows.reshape(-1, 3))
 
 
-def _y_up(x: Floats) -> Floats:
+def _z_up_to_y_up(x: Floats) -> Floats:
     return np.stack([x[..., 0], x[..., 2], -x[..., 1]], axis=-1)
 
 
-def _y_down(x: Floats) -> Floats:
+def _y_up_to_z_up(x: Floats) -> Floats:
     return np.stack([x[..., 0], -x[..., 2], x[..., 1]], axis=-1)

@@ -97,15 +97,15 @@ def _origin_record(motion: ExportedMotion, system: int) -> bytes:
         return b""
     place = round(1e7 * origin.latitude_deg), round(1e7 * origin.longitude_deg)
     fields = _ORIGIN_FIELDS.pack(*place, round(1e3 * origin.altitude), system)
-    return _record(0, _ORIGIN, fields, _ORIGIN_EXTRA)
+    return _mavlink_record(0, _ORIGIN, fields, _ORIGIN_EXTRA)
 
 
 def _disarm_record(milliseconds: int, system: int) -> bytes:
     fields = _COMMAND_FIELDS.pack(*(0.0,) * 7, _ARM_DISARM, system, _AUTOPILOT, 0)
-    return _record(milliseconds, _COMMAND, fields, _COMMAND_EXTRA)
+    return _mavlink_record(milliseconds, _COMMAND, fields, _COMMAND_EXTRA)
 
 
-def _record(milliseconds: int, message: int, fields: bytes, extra: int) -> bytes:
+def _mavlink_record(milliseconds: int, message: int, fields: bytes, extra: int) -> bytes:
     record = _HEAD.pack(1000 * milliseconds, _MARK, len(fields), 0, _STATION, 0, message) + fields
     covered = np.frombuffer(record[9:], dtype=np.uint8)[None]
     return record + _checksum(covered, extra).astype("<u2").tobytes()

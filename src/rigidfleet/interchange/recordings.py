@@ -54,7 +54,7 @@ def write_mcap(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     writer.start(profile="ros2", library="rigidfleet")
     channels = []
     for kind in _PARTS:
-        name, words = f"geometry_msgs/msg/{kind}Stamped", _definition(kind)
+        name, words = f"geometry_msgs/msg/{kind}Stamped", _ros_definition(kind)
         schema = writer.register_schema(name=name, encoding="ros2msg", data=words.encode())
         topics = [f"/agent_{i + 1}/{kind.lower()}" for i in range(n)]
         channels.append([writer.register_channel(topic, "cdr", schema) for topic in topics])
@@ -68,7 +68,7 @@ def write_mcap(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     yield buffer.getvalue()
 
 
-def _definition(kind: str) -> str:
+def _ros_definition(kind: str) -> str:
     """The definition of a stamped pose or twist, and of all types that it has, as ROS 2 writes it."""
     types = [f"geometry_msgs/{name}" for name in (kind, *_PARTS[kind])]
     fields = f"std_msgs/Header header\n{types[0]} {kind.lower()}"

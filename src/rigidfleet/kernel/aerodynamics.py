@@ -3,7 +3,7 @@
 import math
 
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
-from rigidfleet.kernel.disturbances import spline
+from rigidfleet.kernel.disturbances import spline_value
 from rigidfleet.kernel.fleet import jet_speed
 from rigidfleet.kernel.rigid_body import attitude_matrix
 
@@ -20,7 +20,7 @@ def air_velocity(t, h, around, out):
     for s in range(3):
         row = out[s]
         if around.gust.shape[0] > 0:
-            spline(t + 0.5 * s * h, around.gust_step, around.gust, row)
+            spline_value(t + 0.5 * s * h, around.gust_step, around.gust, row)
         for i in range(row.shape[0]):
             for q in range(3):
                 gust = row[i, q] if around.gust.shape[0] > 0 else 0.0
@@ -50,7 +50,7 @@ def add_downwash(S, vehicles, density, T, out):
 
 
 @jit
-def ground_effect(z, R, span):
+def ground_effect_factor(z, R, span):
     """Factor of the thrust at a height z [m] above the ground, for rotors of radius R [m].
 
     Cheeseman and Bennett (1955) for one rotor, extended to the neighbouring rotors at the distance d, the opposite ones

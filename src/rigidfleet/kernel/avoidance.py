@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.solids.records import CYLINDER, HEIGHTS, Solids, join
+from rigidfleet.solids.records import CYLINDER, HEIGHTS, Solids, join_solids
 from rigidfleet.typing import Floats, Ints
 
 #: Columns of `AvoidanceArrays.count`: ticks, entries of the list of neighbours, whether the list is too short.
@@ -65,7 +65,7 @@ def initial_sight(
     drawn = np.random.default_rng(seed).standard_normal(_DRAWS) if noise else np.zeros(1)
     centre, radius = np.zeros((count, 3)), np.zeros(count)
     for o in range(count):
-        centre[o], radius[o] = _ball(solids, o)
+        centre[o], radius[o] = _bounding_ball(solids, o)
     return Sight(
         moves=moves.astype(np.int64), reach=float(reach), noise=float(noise), swerve=float(swerve), normals=drawn,
         centre=centre, ball=radius, known=np.full(count, UNKNOWN), track=np.zeros((count, 6)),
@@ -73,7 +73,7 @@ def initial_sight(
     )  # fmt: skip
 
 
-def _ball(solids: Solids, o: int) -> tuple[Floats, float]:
+def _bounding_ball(solids: Solids, o: int) -> tuple[Floats, float]:
     """Middle (3,) and radius [m] of a ball that holds obstacle o; the radius of a ground or terrain is infinite."""
     size, origin = solids.size[o], solids.origin[o]
     if solids.kind[o] == CYLINDER:
@@ -194,21 +194,23 @@ def avoidance_arrays(
 
     Obstacles that move are known in advance, without ``seen``.
     """
-    solids = join([]) if solids is None else solids
+    solids = join_solids([]) if solids is None else solids
     n, count = len(b), len(solids.kind)
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
     radius = np.asarray(radius, dtype=float)
     lags: Floats = np.ascontiguousarray(np.broadcast_to(np.asarray(ahead, dtype=float), (n, 3, 3)))
     return AvoidanceArrays(
         law=np.zeros(2, dtype=np.int64), guarded=guarded, filtered=filtered, period=float(period), rate=float(rate),
-        share=float(share), release=float(release), b=_full(b, n), lift=_full(lift, n), weight=_full(mass, n),
-        inverse=1.0 / _full(mass, n),
-        g=float(g), coast=_coast(_full(drag, n), period), lag=_full(lag, n), spare=_full(spare, n),
+        share=float(share), release=float(release), b=_per_agent(b, n), lift=_per_agent(lift, n),
+        weight=_per_agent(mass, n), inverse=1.0 / _per_agent(mass, n),
+        g=float(g), coast=_coast_coefficients(_per_agent(drag, n), period),
+        lag=_per_agent(lag, n), spare=_per_agent(spare, n),
         ahead=lags, lead=lags[:, :, 0] + lags[:, :, 2], soft=np.where(lags[:, 0, 0] > 0.0, b * np.asarray(lag), 0.0),
-        tilt=_full(tilt, n), requested=np.zeros((n, 3)), commanded=np.where(lags[:, :, 0] > 0.0, np.inf, 0.0),
+        tilt=_per_agent(tilt, n), requested=np.zeros((n, 3)), commanded=np.where(lags[:, :, 0] > 0.0, np.inf, 0.0),
         overruled=np.zeros(n, dtype=np.int64),
         room=radius + 0.5 * separation, reach=radius + clearance,
-        solids=solids, sight=initial_sight(solids) if seen is None else seen, flow=flow, candidates=candidates(),
+        solids=solids, sight=initial_sight(solids) if seen is None else seen, flow=flow,
+        candidates=candidate_accelerations(),
         start=np.zeros(n + 1, dtype=np.int64), near=np.zeros(capacity, dtype=np.int64), floor=np.zeros(capacity),
         order=np.arange(n), listed=np.full((n, 3), np.inf), span=np.zeros(3),
         known=np.zeros((3, n, 3)), wanted=np.zeros((n, 3)), shift=np.zeros((n, 3)),
@@ -217,14 +219,14 @@ def avoidance_arrays(
         late=np.zeros(n), shifted=np.zeros((4, 3)), trial=np.zeros((5, 3)), normal=np.zeros(3),
         hold=np.ones(n), pull=np.zeros(edges),
         system=np.zeros((EXACT, EXACT)), right=np.zeros(EXACT), active=np.zeros(EXACT, dtype=np.int64),
-        count=np.zeros(3, dtype=np.int64), **_arrays_by_obstacle(n, count), **_empty_record(n),
+        count=np.zeros(3, dtype=np.int64), **_arrays_by_obstacle(n, count), **_empty_avoidance_record(n),
     )  # fmt: skip
 
 
 def for_next_phase(avoidance: AvoidanceArrays) -> AvoidanceArrays:
     """The same avoidance in the next phase, which has a record of its own."""
     avoidance.count[TICKS] = 0
-    return avoidance._replace(**_empty_record(len(avoidance.b)))
+    return avoidance._replace(**_empty_avoidance_record(len(avoidance.b)))
 
 
 def with_obstacles(avoidance: AvoidanceArrays, solids: Solids) -> AvoidanceArrays:
@@ -258,7 +260,7 @@ def with_edges(avoidance: AvoidanceArrays, edges: int) -> AvoidanceArrays:
     return avoidance._replace(pull=np.zeros(edges))
 
 
-def _empty_record(n: int) -> dict[str, Any]:
+def _empty_avoidance_record(n: int) -> dict[str, Any]:
     none = np.full((2, 2), -1)
     endless = np.array([[math.inf, 0.0]] * 2)
     return {
@@ -267,7 +269,7 @@ def _empty_record(n: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def needed_rate(gap, s, across, B, rate, soft=0.0):
+def needed_gap_acceleration(gap, s, across, B, rate, soft=0.0):
     """Least second derivative of a distance by a barrier, see `barriers`; ``across``: the part that motion gives.
 
     For numbers and arrays: the gap to what is to be kept [m], its rate s, the braking B to reckon with, and the speed
@@ -278,11 +280,11 @@ def needed_rate(gap, s, across, B, rate, soft=0.0):
     return -rate * (root - soft + s) - B * s / root - across
 
 
-def _full(x: ArrayLike, n: int) -> Floats:
+def _per_agent(x: ArrayLike, n: int) -> Floats:
     return np.ascontiguousarray(np.broadcast_to(np.asarray(x, dtype=float), (n,)))
 
 
-def _coast(k: Floats, T: float) -> Floats:
+def _coast_coefficients(k: Floats, T: float) -> Floats:
     """Coefficients (N, 3) of a motion under a held acceleration and linear drag; see `AvoidanceArrays.coast`."""
     x = k * T
     E = np.exp(-x)
@@ -297,13 +299,13 @@ def _coast(k: Floats, T: float) -> Floats:
     return np.stack([E, first, second], axis=1)
 
 
-def candidates() -> Floats:
+def candidate_accelerations() -> Floats:
     """Accelerations (39, 3) in units of b: 26 directions and 12 weaker ones, spread evenly, and none."""
 
-    def directions(count: int) -> Floats:
+    def spread_directions(count: int) -> Floats:
         i = np.arange(count) + 0.5  # a Fibonacci lattice
         polar, angle = np.arccos(1.0 - 2.0 * i / count), math.pi * (1.0 + math.sqrt(5.0)) * i
         across = np.sin(polar)
         return np.stack([across * np.cos(angle), across * np.sin(angle), np.cos(polar)], axis=1)
 
-    return np.concatenate([directions(26), 0.4 * directions(12), np.zeros((1, 3))])
+    return np.concatenate([spread_directions(26), 0.4 * spread_directions(12), np.zeros((1, 3))])

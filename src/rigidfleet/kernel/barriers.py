@@ -26,7 +26,7 @@ import math
 
 from rigidfleet.kernel.attitude_control import limit_tilt
 from rigidfleet.kernel.avoidance import BARRIER, EXACT, KNOWN
-from rigidfleet.kernel.avoidance import needed_rate as _needed_rate
+from rigidfleet.kernel.avoidance import needed_gap_acceleration as _needed_rate
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.constraint import find_multipliers
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve

@@ -31,7 +31,7 @@ _SQUARE = np.array(
 
 
 @jit
-def lowest_value(work, degree, floor):
+def least_polynomial_value(work, degree, floor):
     """Least value of a polynomial over [0, 1] and its place, if below ``floor``; otherwise ``floor`` and -1.
 
     ``work[0]`` holds the Bernstein coefficients. The value is exact to `CLOSE` and rounding; for squares, of eighth
@@ -177,7 +177,7 @@ def shortest_length(curve, floor, work, pieces):
         if start < best:
             best, at = start, piece[15]
         squared_length(piece, 1.0, work[0])
-        _, place = lowest_value(work, 8, best * best)
+        _, place = least_polynomial_value(work, 8, best * best)
         if place >= 0.0:
             length = length_at(piece, place)
             if length < best:
@@ -294,7 +294,7 @@ def least_height_within(points, reach, floor, pieces):
 
 
 @jit
-def shortest_above(curve, own, other, altitude, floor, pieces):
+def least_length(curve, own, other, altitude, floor, pieces):
     """Least |r| of a curve with control points (5, 3) while one of two others is at z >= ``altitude``; its place."""
     best, at, top, count, close, rate = floor, -1.0, 0, 0, stack_curve(curve, pieces), 0.0
     for k in range(1, 5):

@@ -16,7 +16,7 @@ from rigidfleet.kernel.rigid_body import (
 
 
 @jit
-def _series(xx, s):
+def _rate_factors_by_series(xx, s):
     a = 0.5 - xx * (1 / 24 - xx * (1 / 720 - xx / 40320))
     b = 1 / 6 - xx * (1 / 120 - xx * (1 / 5040 - xx / 362880))
     a_dot = -s * (1 / 12 - xx * (1 / 180 - xx * (1 / 6720 - xx / 453600)))
@@ -25,7 +25,7 @@ def _series(xx, s):
 
 
 @jit
-def _closed_form(xx, s):
+def _rate_factors_closed(xx, s):
     x = math.sqrt(xx)
     sin, cos = math.sin(x), math.cos(x)
     a, b = (1.0 - cos) / xx, (x - sin) / (xx * x)
@@ -37,7 +37,7 @@ def _closed_form(xx, s):
 @jit
 def rate_factors(xx, s):
     """a, b and their derivatives over time, of `body_rates`, for xx = |phi|^2 and s = phi . dphi/dt."""
-    return _series(xx, s) if xx < 0.04 else _closed_form(xx, s)
+    return _rate_factors_by_series(xx, s) if xx < 0.04 else _rate_factors_closed(xx, s)
 
 
 @jit

@@ -28,7 +28,7 @@ def spline_weights(t, step, rows):
 
 
 @jit
-def spline(t, step, table, out):
+def spline_value(t, step, table, out):
     """Cubic B-spline with coefficients table (K, N, 3), knots every `step` [s] from 0, into out (N, 3).
 
     Twice continuously differentiable; constant before the first and after the last knot.
@@ -45,7 +45,7 @@ def spline(t, step, table, out):
 
 
 @jit
-def exchange(a, b):
+def swap_contents(a, b):
     """Exchange the contents of a and b, (N, 3) both."""
     for i in range(a.shape[0]):
         for q in range(3):
@@ -53,11 +53,11 @@ def exchange(a, b):
 
 
 @jit
-def sense(t, disturbance, w):
+def swap_in_measured_states(t, disturbance, w):
     """Write measured states into w.r and w.v, and store the true ones in w.r_seen and w.v_seen meanwhile."""
     if disturbance.noise_r.shape[0] > 0:
-        spline(t, disturbance.noise_step, disturbance.noise_r, w.r_seen)
-        spline(t, disturbance.noise_step, disturbance.noise_v, w.v_seen)
+        spline_value(t, disturbance.noise_step, disturbance.noise_r, w.r_seen)
+        spline_value(t, disturbance.noise_step, disturbance.noise_v, w.v_seen)
         for i in range(w.r.shape[0]):
             for q in range(3):
                 r, v = w.r[i, q], w.v[i, q]
@@ -66,7 +66,7 @@ def sense(t, disturbance, w):
 
 
 @jit_inline
-def contact(m, g, floor, z):
+def ground_contact(m, g, floor, z):
     """Damping [N s/m] and upward force [N] of the ground on a lost vehicle of mass m [kg] at height z [m].
 
     In equilibrium with its weight, the vehicle just touches the ground, at the height ``floor`` [m].
@@ -76,17 +76,17 @@ def contact(m, g, floor, z):
 
 
 @jit
-def disturb(t, m, g, disturbance, w):
+def restore_states_and_disturb(t, m, g, disturbance, w):
     """Write true states back into w.r and w.v, true forces into w.f_E, and the aerodynamic force into w.f_D (N, 3) [N].
 
     f_D = drag (wind + gust - v), linear in the velocity through the air. Gravity acts on the true masses,
     not on the assumed ones, m (N,). A lost vehicle has no thrust, and comes to rest on the ground.
     """
     if disturbance.noise_r.shape[0] > 0:
-        exchange(w.r, w.r_seen)
-        exchange(w.v, w.v_seen)
+        swap_contents(w.r, w.r_seen)
+        swap_contents(w.v, w.v_seen)
     if disturbance.gust.shape[0] > 0:
-        spline(t, disturbance.gust_step, disturbance.gust, w.f_D)
+        spline_value(t, disturbance.gust_step, disturbance.gust, w.f_D)
     else:
         for i in range(m.shape[0]):
             w.f_D[i, 0], w.f_D[i, 1], w.f_D[i, 2] = 0.0, 0.0, 0.0
@@ -99,7 +99,7 @@ def disturb(t, m, g, disturbance, w):
         if disturbance.lost[i]:
             over = height_below(w.r[i, 0], w.r[i, 1], w.r[i, 2], disturbance.roofs)
             floor = max(disturbance.floor[i], over + disturbance.radius[i])
-            damping, lift = contact(true, g, floor, w.r[i, 2])
+            damping, lift = ground_contact(true, g, floor, w.r[i, 2])
             for q in range(3):
                 w.f_u[i, q] = 0.0
                 w.f_E[i, q] -= damping * w.v[i, q]

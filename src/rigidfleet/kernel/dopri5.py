@@ -6,7 +6,7 @@ import numpy as np
 
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.dynamics import closed_loop
-from rigidfleet.kernel.gauge import read_gauge
+from rigidfleet.kernel.gauge import write_force_gauge
 from rigidfleet.kernel.records import (
     ACCEPTED,
     ATOL,
@@ -121,7 +121,7 @@ def step_to_knot(t, h, t_end, disturbance):
 @jit
 def keep_start(p, w, state):
     """Record the forces after a jump in the trail."""
-    read_gauge(p, w, state.trail.start)
+    write_force_gauge(p, w, state.trail.start)
 
 
 @jit
@@ -144,7 +144,7 @@ def keep_step(t, h, p, w, state):
         points[2, q] = y + 0.5 * rise + bend / 3.0 + (rest + twist) / 6.0
         points[3, q] = y + 0.75 * rise + 0.25 * (bend + rest)
         points[4, q] = K[TRIAL, q]
-    read_gauge(p, w, state.trail.gauge[row])
+    write_force_gauge(p, w, state.trail.gauge[row])
     state.count[TRAILED] += 1
 
 

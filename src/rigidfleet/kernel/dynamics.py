@@ -10,7 +10,7 @@ import math
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.constraint import constraint_force
 from rigidfleet.kernel.control import input_law
-from rigidfleet.kernel.disturbances import disturb, sense
+from rigidfleet.kernel.disturbances import restore_states_and_disturb, swap_in_measured_states
 from rigidfleet.kernel.outside import call_external
 from rigidfleet.kernel.rigid_body import (
     attitude_matrix,
@@ -53,18 +53,18 @@ def closed_loop(t, y, dy, p, w):
             for s in range(3):
                 w.f_E[i, s] += w.a[i, s]
     if disturbance.active:
-        sense(t, disturbance, w)
+        swap_in_measured_states(t, disturbance, w)
 
     input_law(t, p, w)
 
     if graph.edges.shape[0] > 0:
         constraint_force(t, y, dy, p, w)
     if disturbance.active:
-        disturb(t, m, g, disturbance, w)
+        restore_states_and_disturb(t, m, g, disturbance, w)
         # The frame rotates with the true motion of the body
         if p.has_frame and disturbance.noise_r.shape[0] > 0:
             mean_axes(r, v, m, vehicles.M, w)
-    accelerate(dy, p, w)
+    write_accelerations(dy, p, w)
     if p.body_formulation:
         body_derivatives(y, dy, p, w)
     if p.has_frame:
@@ -73,7 +73,7 @@ def closed_loop(t, y, dy, p, w):
 
 
 @jit_inline
-def accelerate(dy, p, w):
+def write_accelerations(dy, p, w):
     """Newton's law, Eqs. (1), (2), with true masses and what vehicles can give: w.a (N, 3) [m/s^2].
 
     In world axes, also dy of r and v.
@@ -100,12 +100,12 @@ def world_states(y, p, w):
     """Positions and velocities in world axes from the states of the body formulation: v by Eq. (22)."""
     n = p.vehicles.m.shape[0]
     q = 6 * n + p.graph.edges.shape[0]
-    turn_back(w.T, y[: 3 * n], y[q + 4 : q + 7], w.r)
-    turn_back(w.T, y[3 * n : 6 * n], y[q + 7 : q + 10], w.v)
+    turn_to_world(w.T, y[: 3 * n], y[q + 4 : q + 7], w.r)
+    turn_to_world(w.T, y[3 * n : 6 * n], y[q + 7 : q + 10], w.v)
 
 
 @jit
-def turn_back(T, x, origin, out):
+def turn_to_world(T, x, origin, out):
     """out_i = origin + T^T x_i (N, 3), of x (3N,)."""
     # Scalars instead of elements: for the compiler, the output could alias the elements.
     T00, T01, T02 = T[0, 0], T[0, 1], T[0, 2]

@@ -16,7 +16,7 @@ from rigidfleet.kernel.clock_records import VehicleClocks, clocks_at_start, same
 from rigidfleet.kernel.mail import Links, Mail, empty_mail, no_network
 from rigidfleet.kernel.problem import Workspace, padded, zeros
 from rigidfleet.kernel.records import NO_TRAIL, Trail
-from rigidfleet.solids.records import Solids, join
+from rigidfleet.solids.records import Solids, join_solids
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: State of a vehicle: r (3) [m], v (3) [m/s], q (4), omega (3) [rad/s, body axes], speeds of the rotors (4) [rad/s].
@@ -46,7 +46,7 @@ def speed_of(thrust, k0, k1, k2):
     return (np.sqrt(np.maximum(0.0, k1 * k1 + 4.0 * k2 * (thrust - k0))) - k1) / (2.0 * k2)
 
 
-def _three(values: ArrayLike) -> tuple[float, float, float]:
+def _as_three_floats(values: ArrayLike) -> tuple[float, float, float]:
     a, b, c = np.asarray(values, dtype=float).tolist()
     return a, b, c
 
@@ -92,13 +92,13 @@ class VehicleDynamics:
 
     def thrust_at(self, speed: ArrayLike) -> Floats:
         """Thrust [N] of a rotor at a speed [rad/s]."""
-        return thrust_of(np.asarray(speed, dtype=float), *_three(self.thrust))
+        return thrust_of(np.asarray(speed, dtype=float), *_as_three_floats(self.thrust))
 
     def speed_at(self, thrust: ArrayLike) -> Floats:
         """Speed [rad/s] of a rotor with a thrust [N]."""
-        return speed_of(np.asarray(thrust, dtype=float), *_three(self.thrust))
+        return speed_of(np.asarray(thrust, dtype=float), *_as_three_floats(self.thrust))
 
-    def allocation(self, g: float) -> Floats:
+    def allocation_matrix(self, g: float) -> Floats:
         """Matrix (4, 4) from thrust [N] and torque [N m] to the rotors' forces.
 
         The ratio of a rotor's torque to its thrust is that at hover; without gravity, that at half the greatest thrust.
@@ -106,7 +106,7 @@ class VehicleDynamics:
         if self.point:
             return np.zeros((4, 4))
         hover = self.speed_at(0.25 * self.m * g or 0.5 * self.thrust_at(self.speed)[1])
-        ratio = thrust_of(hover, *_three(self.torque)) / self.thrust_at(hover)
+        ratio = thrust_of(hover, *_as_three_floats(self.torque)) / self.thrust_at(hover)
         rotors, spin = np.asarray(self.rotors, dtype=float), np.asarray(self.spin, dtype=float)
         mixing = np.stack([np.ones(4), rotors[:, 1], -rotors[:, 0], ratio * spin])
         if np.linalg.matrix_rank(mixing) < 4:
@@ -339,7 +339,7 @@ def jet_speed(weight, density, radius, span, s, rr):
 # -- making them -------------------------------------------------------------------------------------
 
 
-def quadrotors(vehicles: Sequence[VehicleDynamics], g: float = 9.81) -> Quadrotors:
+def quadrotor_arrays(vehicles: Sequence[VehicleDynamics], g: float = 9.81) -> Quadrotors:
     """Put vehicles into arrays."""
 
     def rows(name: str) -> Floats:
@@ -353,7 +353,7 @@ def quadrotors(vehicles: Sequence[VehicleDynamics], g: float = 9.81) -> Quadroto
     return Quadrotors(
         **{name: rows(name) for name in names},
         force=np.array([v.thrust_at(v.speed) for v in vehicles]),
-        unmix=np.array([v.allocation(g) for v in vehicles]),
+        unmix=np.array([v.allocation_matrix(g) for v in vehicles]),
         span=np.array([[gap.min(), gap.max()] for gap in gaps]),
         point=np.array([v.point for v in vehicles]),
         lost=np.zeros(len(vehicles), dtype=np.bool_),
@@ -363,7 +363,7 @@ def quadrotors(vehicles: Sequence[VehicleDynamics], g: float = 9.81) -> Quadroto
 
 def still_air(n: int) -> Air:
     """Air at rest, without downwash and ground effect."""
-    nothing = np.full(n, -np.inf), np.zeros(n), join([])
+    nothing = np.full(n, -np.inf), np.zeros(n), join_solids([])
     return Air(np.zeros(3), 1.0, np.zeros((0, n, 3)), False, False, 1.225, 0.0, *nothing)
 
 
@@ -372,7 +372,7 @@ def exact_sensing(n: int) -> Sensing:
     return Sensing(1, np.zeros(n, dtype=np.int64))
 
 
-def no_tables(n: int) -> TickInputs:
+def empty_inputs(n: int) -> TickInputs:
     """No feedforward, yaw 0, no noise, nothing dropped."""
     none = np.zeros((0, n, 3))
     return TickInputs(
@@ -394,7 +394,7 @@ def ideal_flight(
     n = len(vehicles.m)
     return SampledFlight(
         vehicles, still_air(n), exact_sensing(n), no_network(n), same_clock(n),
-        Guidance(np.zeros(n), np.zeros((n, 3))), no_tables(n), no_commands(n), start, h, steps, every,
+        Guidance(np.zeros(n), np.zeros((n, 3))), empty_inputs(n), no_commands(n), start, h, steps, every,
     )  # fmt: skip
 
 
@@ -429,7 +429,7 @@ def initial_state(
     depth = 1 + int(flight.sensing.delay.max())
     known = np.ascontiguousarray(S[:, :6])
     past = np.tile(known, (depth, 1, 1))
-    attitude = _frame(frame)
+    attitude = _initial_frame(frame)
     curves = flight.vehicles.thrust.T[:, :, None]
     peak = np.where(flight.vehicles.point[:, None], 0.0, thrust_of(S[:, 13:], *curves))
     worst = np.zeros((n, VERTICAL + 1))
@@ -449,7 +449,7 @@ def initial_state(
         layers=np.zeros(n, dtype=np.int64), seen=known, history=past,
         mail=mail, tau=clocks_at_start(n), peak=peak, peak_time=times[:, :4].copy(),
         worst=worst, worst_time=times, saturations=np.zeros(n, dtype=np.int64), trail=trail,
-        work=_work(n, m),
+        work=_new_work_arrays(n, m),
     )  # fmt: skip
 
 
@@ -464,19 +464,19 @@ def state_under_problem(
     state.clock[LAW_TIME], state.count[LAWS] = state.clock[TIME], 0
     n = len(state.S)
     return state._replace(
-        integral=np.array(integral, dtype=float), frame=_frame(frame),
-        work=_work(n, len(workspace.c)),
+        integral=np.array(integral, dtype=float), frame=_initial_frame(frame),
+        work=_new_work_arrays(n, len(workspace.c)),
     )  # fmt: skip
 
 
-def _frame(q: Floats | None) -> Floats:
+def _initial_frame(q: Floats | None) -> Floats:
     """A frame at the start, which has no rates yet."""
     rows = np.zeros((3, 4))
     rows[0] = (1.0, 0.0, 0.0, 0.0) if q is None else q
     return rows
 
 
-def _work(n: int, m: int) -> SampledWork:
+def _new_work_arrays(n: int, m: int) -> SampledWork:
     size = 6 * n + m + 4
     return SampledWork(
         zeros(7, padded(n * STATES)), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
@@ -484,7 +484,7 @@ def _work(n: int, m: int) -> SampledWork:
     )  # fmt: skip
 
 
-def segment(
+def sampled_segment(
     n: int, m: int, t_end: float, times: ArrayLike = (), max_steps: int = ENDLESS, links: int = 0
 ) -> SampledSegment:
     """A flight of n vehicles with m edges to ``t_end`` [s], sampled at ``times`` (K,) [s]."""

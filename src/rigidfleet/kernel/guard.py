@@ -39,8 +39,8 @@ from rigidfleet.kernel.moving import (
     is_obstacle_known,
     margin_beside_moving,
     miss_distance,
-    room_beside,
     steer_round_obstacles,
+    surplus_beside_moving,
     update_tracks,
     way_to_rest,
     write_stop_beside,
@@ -426,7 +426,7 @@ def propose_candidate(i, k, v, a, c):
         c[0], c[1], c[2] = a.wanted[i, 0], a.wanted[i, 1], a.wanted[i, 2]
         if a.soft[i] > 0.0 and a.overruled[i] == 0 and not is_pushed(i, a):
             for q in range(3):
-                c[q] = immediate_choice(i, q, a)
+                c[q] = choice_to_obey_at_once(i, q, a)
     elif k < last:
         for q in range(3):
             c[q] = a.b[i] * a.candidates[k - 1, q]
@@ -435,14 +435,14 @@ def propose_candidate(i, k, v, a, c):
 
 
 @jit
-def room_if_braking(i, r, v, late, a):
+def least_margin_if_braking(i, r, v, late, a):
     """What `choose_acceleration` compares of vehicle i, if it brakes [m]."""
     c = a.trial[3]
     braking_acceleration(i, v[i], a, c)
     if late:
         return miss_distance(r[i], v[i], c, a)
     predict_motion(i, r[i], v[i], c, a, a.trial)
-    return room_beside(i, v[i], a)
+    return surplus_beside_moving(i, v[i], a)
 
 
 @jit
@@ -466,7 +466,7 @@ def choose_acceleration(i, r, v, a):
         far = predict_motion(i, r[i], v[i], c, a, a.trial)
         if not is_safe(i, r, v, far, a):
             continue
-        room = miss_distance(r[i], v[i], c, a) if late else room_beside(i, v[i], a)
+        room = miss_distance(r[i], v[i], c, a) if late else surplus_beside_moving(i, v[i], a)
         if late or room < 0.0:
             if room > most:
                 most, second = room, k
@@ -476,7 +476,7 @@ def choose_acceleration(i, r, v, a):
             accept_candidate(i, far, a)
             return 0
     if nearest < 0:
-        if second < 0 or room_if_braking(i, r, v, late, a) >= most:
+        if second < 0 or least_margin_if_braking(i, r, v, late, a) >= most:
             return 2
         nearest = second
     propose_candidate(i, nearest, v[i], a, c)
@@ -515,16 +515,16 @@ def wanted_acceleration(i, state, a):
             a.requested[i, q] = a.wanted[i, q]
             if not a.commanded[i, q] < math.inf:
                 a.commanded[i, q] = a.requested[i, q]
-            a.wanted[i, q] = immediate_choice(i, q, a)
+            a.wanted[i, q] = choice_to_obey_at_once(i, q, a)
         limit_thrust(i, a)
         for q in range(3):
-            off = max(off, abs(a.wanted[i, q] - immediate_choice(i, q, a)))
+            off = max(off, abs(a.wanted[i, q] - choice_to_obey_at_once(i, q, a)))
         if off < _ROUNDING:
             a.overruled[i] = 0
 
 
 @jit
-def immediate_choice(i, q, a):
+def choice_to_obey_at_once(i, q, a):
     """The choice, along axis q, that has vehicle i follow what it is asked for at once."""
     return a.commanded[i, q] + (1.0 + a.ahead[i, q, 2] / a.period) * (
         a.requested[i, q] - a.commanded[i, q]

@@ -44,7 +44,7 @@ class Measured(NamedTuple):
     x: Annotated[Floats, Extents((2, "N", 3))]  # agents and slots about their centres
 
 
-def measurement_of(n: int, m: int, K: int, **samples: Any) -> Measured:
+def measurement_arrays(n: int, m: int, K: int, **samples: Any) -> Measured:
     """Arrays for the measurement of K samples of ``n`` agents and ``m`` edges."""
     work = np.zeros((9, 4, 4))
     work[5] = np.eye(4)

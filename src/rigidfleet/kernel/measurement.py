@@ -146,7 +146,7 @@ def quaternion_of(T, q):
 
 
 @jit
-def keep_sign(q, last):
+def choose_quaternion_sign(q, last):
     """Choose the sign of a quaternion q (4,): no jump from the one before, ``last``, or else q0 >= 0."""
     if math.isnan(q[0] + q[1] + q[2] + q[3]):
         return
@@ -294,14 +294,14 @@ def eigenvector_of(I, x, axis):
         axis[0], axis[1], axis[2] = B, D, E
     else:
         axis[0], axis[1], axis[2] = C, E, F
-    size = length(axis[0], axis[1], axis[2])
+    size = vector_length(axis[0], axis[1], axis[2])
     for k in range(3):
         axis[k] /= size
     return a * A + b * B + c * C
 
 
 @jit
-def attitude_of(m, k, known, line_known, near, work, T):
+def measure_attitude(m, k, known, line_known, near, work, T):
     """Attitude of the slots at sample k into ``m.attitude`` and T (3, 3); returns whether they count as a line.
 
     ``near`` (3, 3) is the attitude expected, commanded (``known``) or that of the sample before. ``line_known`` tells
@@ -341,7 +341,7 @@ def attitude_of(m, k, known, line_known, near, work, T):
 
 
 @jit
-def measure(m):
+def measure_samples(m):
     """Measure all samples."""
     n, work = m.mass.shape[0], m.work
     T, near, last = work[4], work[5], work[6]
@@ -377,7 +377,7 @@ def measure(m):
                     for a in range(3):
                         for b in range(3):
                             near[a, b] = m.T_ref[k, a, b]
-                line = m.line[k] = attitude_of(m, k, commanded, same, near, work, T)
+                line = m.line[k] = measure_attitude(m, k, commanded, same, near, work, T)
                 for a in range(3):
                     for b in range(3):
                         near[a, b] = T[a, b]
@@ -388,14 +388,14 @@ def measure(m):
             else:
                 for a in range(4):
                     m.attitude[k, a] = math.nan
-            keep_sign(m.attitude[k], last[0])
+            choose_quaternion_sign(m.attitude[k], last[0])
             if not math.isnan(m.T_ref[k, 0, 0]):
                 quaternion_of(m.T_ref[k], m.attitude_reference[k])
-                keep_sign(m.attitude_reference[k], last[1])
+                choose_quaternion_sign(m.attitude_reference[k], last[1])
             if k == 0 or math.isnan(last[2, 0]):
                 for a in range(4):
                     last[2, a] = m.frame[k, a]
-            keep_sign(m.frame[k], last[2])
+            choose_quaternion_sign(m.frame[k], last[2])
             angular_momentum(m, k, mass, h)
             inertia(m.x[0], mass, zero, I)
             if line:
@@ -411,11 +411,11 @@ def measure(m):
             else:
                 multiply(T, omega, m.rates[k])
                 if left < n:
-                    move_origin(m, k, T, centre, omega, h)
+                    recentre_incomplete_body(m, k, T, centre, omega, h)
 
 
 @jit
-def move_origin(m, k, T, centre, omega, offset):
+def recentre_incomplete_body(m, k, T, centre, omega, offset):
     """Move the centre of mass of the agents left to the origin of the body, of which some agents are missing."""
     multiply_transposed(T, centre, offset)
     for a in range(3):
@@ -425,7 +425,7 @@ def move_origin(m, k, T, centre, omega, offset):
 
 
 @jit_exact
-def length(x, y, z):
+def vector_length(x, y, z):
     """Length of a vector."""
     return math.sqrt(x * x + y * y + z * z)
 
@@ -443,7 +443,7 @@ def measure_motion(m, k, mass, M):
         for a in range(3):
             m.x[0, i, a] = r[i, a] - m.cm[k, a]
             m.wrench[k, a] += f[i, a]
-        thrust = length(f[i, 0] + g[i, 0], f[i, 1] + g[i, 1], f[i, 2] + g[i, 2])
+        thrust = vector_length(f[i, 0] + g[i, 0], f[i, 1] + g[i, 1], f[i, 2] + g[i, 2])
         m.thrust[k, i] = m.limit[i] if thrust > m.limit[i] else thrust
         x, y, z = m.x[0, i, 0], m.x[0, i, 1], m.x[0, i, 2]
         m.wrench[k, 3] += y * f[i, 2] - z * f[i, 1]
@@ -453,7 +453,7 @@ def measure_motion(m, k, mass, M):
         i, j = m.edges[e, 0], m.edges[e, 1]
         x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
         both = mass[i] > 0.0 and mass[j] > 0.0
-        m.distance[k, e] = length(x, y, z) if both else math.nan
+        m.distance[k, e] = vector_length(x, y, z) if both else math.nan
 
 
 @jit

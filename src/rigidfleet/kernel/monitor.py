@@ -24,17 +24,17 @@ from rigidfleet.kernel.bernstein import (
     ball_radius,
     distance_to_box,
     least_height_within,
+    least_length,
+    least_polynomial_value,
     length_at,
-    lowest_value,
     point_at,
-    shortest_above,
     shortest_length,
     squared_length,
     tangent_of_box,
     write_basis,
 )
 from rigidfleet.kernel.compiler.jit import jit
-from rigidfleet.kernel.gauge import read_gauge
+from rigidfleet.kernel.gauge import write_force_gauge
 from rigidfleet.kernel.outside import call_recorder
 from rigidfleet.kernel.records import (
     ACCELERATION,
@@ -180,7 +180,7 @@ def point_from_mean(points, k, i, mean):
 
 
 @jit
-def find_mean(points, monitor, mean):
+def mean_control_points(points, monitor, mean):
     """Mean (5, 3) of the control points of the agents that are monitored."""
     count = 0
     for i in range(monitor.left.shape[0]):
@@ -195,7 +195,7 @@ def find_mean(points, monitor, mean):
 
 
 @jit
-def rotation_over(points, mean, monitor):
+def rotation_over_step(points, mean, monitor):
     """Rotation [rad] about each axis by which agents turn about their mean over a step.
 
     It is that of a rigid body with their moment of momentum, for equal masses at the places halfway: no other leaves
@@ -233,9 +233,9 @@ def bound_changes(p, state, monitor):
     |u_i| + |u_j|, and |u_i| is at most its greatest Bernstein coefficient. The rotation is the one that leaves the
     smallest u_i. As seen from above, tilting rotations change distances, too.
     """
-    points, mean = state.trail.points[row_of(0, state)], monitor.knots
-    find_mean(points, monitor, mean)
-    turn_x, turn_y, turn_z = rotation_over(points, mean, monitor)
+    points, mean = state.trail.points[trail_row_of(0, state)], monitor.knots
+    mean_control_points(points, monitor, mean)
+    turn_x, turn_y, turn_z = rotation_over_step(points, mean, monitor)
     fastest = farthest = 0.0
     for i in range(monitor.left.shape[0]):
         if not monitor.left[i]:
@@ -319,7 +319,7 @@ def watch_pairs(kind, pairs, points, t, h, monitor):
         if below:
             value, at = least_height_within(curve, radii, floor, monitor.pieces)
         elif flying:
-            value, at = shortest_above(curve, own, other, monitor.altitude, floor, monitor.pieces)
+            value, at = least_length(curve, own, other, monitor.altitude, floor, monitor.pieces)
         else:
             value, at = shortest_length(curve, floor, monitor.work, monitor.pieces)
         if at >= 0.0:
@@ -334,7 +334,7 @@ def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
         work[0, k] = sign * curve[k, axis] - offset
         bound = min(bound, work[0, k])
     if bound < monitor.worst[kind] - CLOSE:
-        value, at = lowest_value(work, 4, monitor.worst[kind])
+        value, at = least_polynomial_value(work, 4, monitor.worst[kind])
         if at >= 0.0:
             take_if_worse(kind, value, t + at * h, i, -1, monitor)
 
@@ -353,7 +353,7 @@ def watch_speed(kind, curve, low, high, t, h, i, monitor):
     if fastest <= greatest * abs(greatest):
         return
     squared_length(piece, -1.0, monitor.work[0])
-    _, at = lowest_value(monitor.work, 8, -greatest * abs(greatest))
+    _, at = least_polynomial_value(monitor.work, 8, -greatest * abs(greatest))
     if at >= 0.0:
         take_if_worse(kind, -length_at(piece, at), t + at * h, i, -1, monitor)
 
@@ -433,7 +433,7 @@ def watch_distances(first, end, p, state, monitor):
 @jit
 def watch_step(step, p, state, monitor):
     """Take the extremes of distances and speeds over one step of the trail."""
-    trail, row = state.trail, row_of(step, state)
+    trail, row = state.trail, trail_row_of(step, state)
     points, t, h = trail.points[row], trail.clock[row, 0], trail.clock[row, 1]
     enclose_agents(points, monitor)
     watch_pairs(SEPARATION, monitor.pairs, points, t, h, monitor)
@@ -521,7 +521,7 @@ def worst_so_far(c, p, monitor):
 @jit
 def evaluate_forces(t, step, p, w, state, monitor, values):
     """Forces at time t [s], within a step of the trail, into a gauge."""
-    trail, row = state.trail, row_of(step, state)
+    trail, row = state.trail, trail_row_of(step, state)
     x = (t - trail.clock[row, 0]) / trail.clock[row, 1]
     basis, y = monitor.basis[0], monitor.states[0]
     write_basis(min(max(x, 0.0), 1.0), basis)
@@ -530,7 +530,7 @@ def evaluate_forces(t, step, p, w, state, monitor, values):
     monitor.time[0] = t
     # The recorder contains the compiled law; without rows to write, it leaves all values in the workspace.
     call_recorder(monitor.recorder, p, w, monitor.segment, monitor.record)
-    read_gauge(p, w, values)
+    write_force_gauge(p, w, values)
     take_forces(values, t, p, monitor)
 
 
@@ -588,7 +588,7 @@ def search_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor
         at[k], rank[k] = ta if k == 0 else tb if k == 1 else tc, k
     # Entries peak at different times: the most promising one is looked at first, and all are judged there.
     for count in range(3, at.shape[0]):
-        in_step = step if top <= end_time(step, state) else step + 1
+        in_step = step if top <= step_end_time(step, state) else step + 1
         evaluate_forces(top, in_step, p, w, state, monitor, values[count])
         # Into its place by time: values stay where they are, ``rank`` says their order.
         k = count
@@ -612,22 +612,22 @@ def search_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor
 
 
 @jit
-def row_of(step, state):
+def trail_row_of(step, state):
     """Row of the trail that holds one of the steps in it, which are numbered from 0."""
     return (state.count[FIRST_ROW] + step) % state.trail.clock.shape[0]
 
 
 @jit
-def end_time(step, state):
+def step_end_time(step, state):
     """Time [s] at which a step of the trail ends."""
-    row = row_of(step, state)
+    row = trail_row_of(step, state)
     return state.trail.clock[row, 0] + state.trail.clock[row, 1]
 
 
 @jit
 def watch_lone_step(step, before, after, p, w, state, monitor):
     """Search a step that has no neighbour, because of a jump or the end."""
-    start, end = state.trail.clock[row_of(step, state), 0], end_time(step, state)
+    start, end = state.trail.clock[trail_row_of(step, state), 0], step_end_time(step, state)
     middle, values = 0.5 * (start + end), monitor.gauge[1]
     evaluate_forces(middle, step, p, w, state, monitor, values)
     search_between(before, values, after, step, start, middle, end, p, w, state, monitor)
@@ -643,10 +643,10 @@ def watch_forces(last, p, w, state, monitor):
     stayed = monitor.count[STAYED] == 1
     for step in range(steps):
         new = step > 0 or not stayed
-        row = row_of(step, state)
-        start, end = trail.clock[row, 0], end_time(step, state)
+        row = trail_row_of(step, state)
+        start, end = trail.clock[row, 0], step_end_time(step, state)
         after = trail.gauge[row]
-        earlier = trail.gauge[row_of(step - 1, state)] if step > 0 else before
+        earlier = trail.gauge[trail_row_of(step - 1, state)] if step > 0 else before
         if step == 0 and new:
             for c in range(before.shape[0]):
                 before[c] = trail.start[c]
@@ -656,22 +656,22 @@ def watch_forces(last, p, w, state, monitor):
         if step == 0 and new:
             watch_lone_step(0, before, after, p, w, state, monitor)
         if step + 1 < steps:
-            then, until = trail.gauge[row_of(step + 1, state)], end_time(step + 1, state)
+            then, until = trail.gauge[trail_row_of(step + 1, state)], step_end_time(step + 1, state)
             search_between(earlier, after, then, step, start, end, until, p, w, state, monitor)
         elif last and (step > 0 or not new):
             watch_lone_step(step, earlier, after, p, w, state, monitor)
     if last or steps == 0:
         monitor.count[STAYED], state.count[TRAILED] = 0, 0
     else:
-        keep_last_step(steps, state, monitor)
+        keep_only_last_step(steps, state, monitor)
 
 
 @jit
-def keep_last_step(steps, state, monitor):
+def keep_only_last_step(steps, state, monitor):
     """Leave the last of the ``steps`` alone in the trail, and keep the forces at the end of the one before it."""
     if steps > 1:
-        before = state.trail.gauge[row_of(steps - 2, state)]
+        before = state.trail.gauge[trail_row_of(steps - 2, state)]
         for c in range(before.shape[0]):
             monitor.gauge[0, c] = before[c]
-    state.count[FIRST_ROW] = row_of(steps - 1, state)
+    state.count[FIRST_ROW] = trail_row_of(steps - 1, state)
     monitor.count[STAYED], state.count[TRAILED] = 1, 1

@@ -17,7 +17,7 @@ from rigidfleet.kernel.avoidance import FOLLOWED, KNOWN, UNKNOWN
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.segments import least_along, point_to_obstacle, segment_to_obstacle
-from rigidfleet.solids.distance import displacement, is_present
+from rigidfleet.solids.distance import is_present, solid_displacement
 
 #: Standard deviations that bounds of an estimate have.
 _SIGMAS = 3.0
@@ -120,7 +120,7 @@ def update_tracks(t, r, lost, a):
         if not is_present(t, o, a.solids):
             s.known[o] = UNKNOWN
             continue
-        x, y, z = displacement(t, o, a.solids)
+        x, y, z = solid_displacement(t, o, a.solids)
         u, v, w = obstacle_velocity(t + 0.5 * T, o, a.solids)
         if s.known[o] != UNKNOWN:
             predict_track(o, T, s)
@@ -203,7 +203,7 @@ def write_stop_beside(i, o, r, v, a):
 
 
 @jit
-def room_beside(i, v, a):
+def surplus_beside_moving(i, v, a):
     """By how much the candidate of vehicle i keeps its distances from obstacles that move [m]; infinite if it is far.
 
     The candidate is ``trial``, the velocity before it v (3,).

@@ -78,7 +78,7 @@ def fade_silent_edges(i, k, ticks, net, mail):
 
 
 @jit
-def extrapolate(j, q, age, message, tracks, w, k1, k2):
+def extrapolate_neighbour(j, q, age, message, tracks, w, k1, k2):
     """Coordinate q of where vehicle j is, how fast, and what its input accelerates it by, ``age`` [s] after a message.
 
     What it is off its slot moves on by its acceleration; the slot moves as planned, whatever the age. Without a slot,
@@ -108,8 +108,8 @@ def equation_of_edge(row, l, k, dt, tick, p, w, net, mail, saturated):
     distance = along = square = pull = 0.0
     x, k1, k2 = rows[row, _UNIT:_RIGHT], p.control.k1, p.control.k2
     for q in range(3):
-        theirs, speed, put = extrapolate(j, q, age, heard, tracks, w, k1, k2)
-        mine, pace, _ = extrapolate(i, q, age, own, tracks, w, k1, k2)
+        theirs, speed, put = extrapolate_neighbour(j, q, age, heard, tracks, w, k1, k2)
+        mine, pace, _ = extrapolate_neighbour(i, q, age, own, tracks, w, k1, k2)
         # Where both are by what both know, and half of what only i knows of itself.
         x[q] = mine + FRESH * (w.r[i, q] - mine) - theirs
         pace += FRESH * (w.v[i, q] - pace) - speed

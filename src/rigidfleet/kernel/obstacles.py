@@ -25,12 +25,12 @@ from rigidfleet.kernel.monitor import (
 )
 from rigidfleet.solids.distance import (
     box_distance,
-    displacement,
+    in_own_axes,
     is_below,
     is_present,
     outward_normal,
-    own_axes,
     signed_distance,
+    solid_displacement,
     triangle_to_point,
 )
 from rigidfleet.solids.records import HEIGHTS
@@ -97,21 +97,21 @@ def cut_curve(curve, start, end, work, out):
 @jit
 def curve_in_axes(curve, t, h, b, s, out):
     """Control points (5, 3) in the axes of solid b, which moves straight from t to t + h."""
-    x0, y0, z0 = displacement(t, b, s)
-    x1, y1, z1 = displacement(t + h, b, s)
+    x0, y0, z0 = solid_displacement(t, b, s)
+    x1, y1, z1 = solid_displacement(t + h, b, s)
     for k in range(5):
         share = 0.25 * k
         x = curve[k, 0] - (x0 + share * (x1 - x0))
         y = curve[k, 1] - (y0 + share * (y1 - y0))
         z = curve[k, 2] - (z0 + share * (z1 - z0))
-        out[k, 0], out[k, 1], out[k, 2] = own_axes(x, y, z, b, s)
+        out[k, 0], out[k, 1], out[k, 2] = in_own_axes(x, y, z, b, s)
 
 
 @jit
 def point_in_axes(x, y, z, t, b, s):
     """Coordinates of a point of the world in the axes of solid b at time t [s]."""
-    u, v, w = displacement(t, b, s)
-    return own_axes(x - u, y - v, z - w, b, s)
+    u, v, w = solid_displacement(t, b, s)
+    return in_own_axes(x - u, y - v, z - w, b, s)
 
 
 @jit

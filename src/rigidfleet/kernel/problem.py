@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.solids.records import Solids, join
+from rigidfleet.solids.records import Solids, join_solids
 from rigidfleet.typing import Bools, Edges, Floats
 
 
@@ -295,7 +295,7 @@ def no_disturbance(masses: Floats) -> Disturbance:
     none = zeros(0, n, 3)
     return Disturbance(
         False, masses, 1.0 / masses, np.zeros(n), np.zeros(3), 1.0, none, 1.0, none, none, np.zeros(n, dtype=np.bool_),
-        np.full(n, -np.inf), np.zeros(n), join([]),
+        np.full(n, -np.inf), np.zeros(n), join_solids([]),
     )  # fmt: skip
 
 

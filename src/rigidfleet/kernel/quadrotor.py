@@ -7,9 +7,9 @@ torque, linear drag, a quadratic lag of the motors and the rotors' angular momen
 
 import math
 
-from rigidfleet.kernel.aerodynamics import ground_effect
+from rigidfleet.kernel.aerodynamics import ground_effect_factor
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
-from rigidfleet.kernel.disturbances import contact
+from rigidfleet.kernel.disturbances import ground_contact
 from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.rigid_body import attitude_matrix, quaternion_rate
 from rigidfleet.kernel.vectors import as_lanes
@@ -34,7 +34,7 @@ def point_derivative(y, command, i, vehicles, air, push, dy):
 
 
 @jit
-def derivative(y, command, i, vehicles, around, air, push, T, dy):
+def quadrotor_derivative(y, command, i, vehicles, around, air, push, T, dy):
     """Derivative dy (17,) of the state y (17,) of vehicle i, see `fleet.STATES`.
 
     Parameters
@@ -49,7 +49,7 @@ def derivative(y, command, i, vehicles, around, air, push, T, dy):
     damping, lift = 0.0, 0.0
     if vehicles.lost[i]:
         over = height_below(y[0], y[1], y[2], around.roofs) + around.radius[i]
-        damping, lift = contact(m, vehicles.g, max(around.floor[i], over), y[2])
+        damping, lift = ground_contact(m, vehicles.g, max(around.floor[i], over), y[2])
     if vehicles.point[i]:
         point_derivative(y, command, i, vehicles, air, push, dy)
     else:
@@ -73,7 +73,7 @@ def derivative(y, command, i, vehicles, around, air, push, T, dy):
         if around.ground_effect:
             over = max(around.ground, height_below(y[0], y[1], y[2], around.roofs))
             if over > -math.inf:
-                gain = ground_effect(y[2] - over, vehicles.radius[i], vehicles.span[i])
+                gain = ground_effect_factor(y[2] - over, vehicles.radius[i], vehicles.span[i])
         k0, k1, k2 = (
             gain * vehicles.thrust[i, 0],
             gain * vehicles.thrust[i, 1],
@@ -134,7 +134,7 @@ def runge_kutta(h, commands, vehicles, around, push, work):
         trial, rate = y[_TRIAL], y[_RATES + stage]
         for i in range(vehicles.m.shape[0]):
             first, air = 17 * i, work.air[(stage + 1) // 2, i]
-            derivative(
+            quadrotor_derivative(
                 trial[first : first + 17], commands[i], i, vehicles, around, air, push[i], work.T,
                 rate[first : first + 17],
             )  # fmt: skip
@@ -145,11 +145,11 @@ def runge_kutta(h, commands, vehicles, around, push, work):
             rows[_END, q] += weight * change
             rows[_TRIAL, q] = rows[_START, q] + reach * change
     for i in range(vehicles.m.shape[0]):
-        normalise(y[_END, 17 * i + 6 : 17 * i + 10])
+        normalise_quaternion(y[_END, 17 * i + 6 : 17 * i + 10])
 
 
 @jit
-def normalise(q):
+def normalise_quaternion(q):
     """Scale a quaternion (4,) to unit length."""
     scale = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     for k in range(4):

@@ -26,7 +26,7 @@ def fill_with_nan(out):
 
 
 @jit
-def record(times, samples, p, w, dy, out, first):
+def write_record(times, samples, p, w, dy, out, first):
     """Evaluate the closed loop at the sampled states, and record its forces and references from row ``first`` on.
 
     Without rows in ``out``, the only result is what the last evaluation leaves in the workspace.

@@ -71,11 +71,11 @@ class Trail(NamedTuple):
 
     clock: Annotated[Floats, Extents((None, 2))]  # start [s], length [s]
     points: Annotated[Floats, Extents((None, 5, None))]  # (S, 5, n)
-    gauge: Floats  # (S, 3N + 2m or 5N + 2m) at the end, see `gauge.read_gauge`
+    gauge: Floats  # (S, 3N + 2m or 5N + 2m) at the end, see `gauge.write_force_gauge`
     start: Floats  # (3N + 2m or 5N + 2m,) at the start of the first step, after a jump
 
 
-def trail(size: int, states: int, agents: int, edges: int, directed: bool) -> Trail:
+def new_trail(size: int, states: int, agents: int, edges: int, directed: bool) -> Trail:
     """Allocate a trail of a ``size`` in bytes, or of three steps; ``directed``: with accelerations by direction."""
     gauge = (5 if directed else 3) * agents + 2 * edges
     rows = max(3, size // (8 * (5 * states + gauge)))
@@ -136,7 +136,7 @@ class Monitor(NamedTuple):
     scratch: Annotated[Floats, Extents((3, 10))]
 
 
-def monitor(
+def new_monitor(
     radius: Floats, boxes: Floats, fence: Floats, states: int, gauge: int, **watched: Any
 ) -> Monitor:
     """A monitor with work arrays of its own. Without the fields that are ``watched``, it has no values and no pairs."""

@@ -4,7 +4,7 @@ from rigidfleet.kernel.compiler.jit import jit
 
 
 @jit
-def recurse(s):
+def run_linear_recursion(s):
     """x_k += a_k x_(k-1) from the first row to the last, or x_k += a_k x_(k+1) from the last to the first.
 
     If there are rows y, of which M columns count, the first row is b_0 y_0, and x_k = b_k y_k + a_k x_(k-1).

@@ -45,13 +45,13 @@ from rigidfleet.kernel.fleet import (
 from rigidfleet.kernel.mail import NONE, PULL, SATURATED, SLOT, TRACKED, A, R, U, V
 from rigidfleet.kernel.neighbours import (
     estimate_acceleration,
-    extrapolate,
+    extrapolate_neighbour,
     fade_silent_edges,
     solve_own_edges,
 )
 from rigidfleet.kernel.network import receive, send
 from rigidfleet.kernel.problem import SHAPE, TRACKING
-from rigidfleet.kernel.quadrotor import normalise, runge_kutta
+from rigidfleet.kernel.quadrotor import normalise_quaternion, runge_kutta
 from rigidfleet.kernel.records import ASKS, COLLAPSED, FINISHED, PAUSED
 from rigidfleet.kernel.references import blend_slots, distance_references
 from rigidfleet.kernel.rigid_body import (
@@ -296,7 +296,7 @@ def is_well_predicted(j, k, p, w, flight, mail):
         return False
     age, tracks = since * flight.steps * flight.h, p.control.kind == TRACKING
     for q in range(3):
-        place, _, _ = extrapolate(j, q, age, mail.last[j], tracks, w, 0.0, 0.0)
+        place, _, _ = extrapolate_neighbour(j, q, age, mail.last[j], tracks, w, 0.0, 0.0)
         square += (w.r[j, q] - place) ** 2
     return square < net.event**2
 
@@ -354,7 +354,7 @@ def advance_frame(t, p, state):
         for q in range(4):
             before = state.frame[1, q] if first else state.frame[2, q]
             state.frame[0, q] += dt * (1.5 * state.frame[1, q] - 0.5 * before)
-        normalise(state.frame[0])
+        normalise_quaternion(state.frame[0])
 
 
 @jit
@@ -390,7 +390,7 @@ def run_tick(k, t, p, w, flight, state, call):
 
 
 @jit
-def advance(S, h, flight, state):
+def advance_states(S, h, flight, state):
     """Advance all vehicles by h [s] in ``work.y``, from states S (N, 17) to row 6."""
     work = state.work
     for i in range(S.shape[0]):
@@ -400,7 +400,7 @@ def advance(S, h, flight, state):
 
 
 @jit
-def find_air(t, h, S, p, flight, state):
+def find_air_velocity(t, h, S, p, flight, state):
     """Velocity of the air [m/s] over a step from states S (N, 17), into ``work.air``; a user's force in its middle.
 
     The force is asked before: position and velocity in the middle of the step stand in rows of the air's until then.
@@ -422,8 +422,8 @@ def find_air(t, h, S, p, flight, state):
 @jit
 def write_derivatives(c, t, p, flight, state, call):
     """Derivatives of the states of sample c: those at the start of a step without length."""
-    find_air(t, 0.0, call.S[c], p, flight, state)
-    advance(call.S[c], 0.0, flight, state)
+    find_air_velocity(t, 0.0, call.S[c], p, flight, state)
+    advance_states(call.S[c], 0.0, flight, state)
     for i in range(state.S.shape[0]):
         for q in range(17):
             call.dS[c, i, q] = state.work.y[2, 17 * i + q]
@@ -439,8 +439,8 @@ def write_samples(t, h, p, flight, state, call):
         if x > h * (1.0 + _SAME):
             return
         x = h if x > h * (1.0 - _SAME) else x
-        find_air(t, x, state.S, p, flight, state)
-        advance(state.S, x, flight, state)
+        find_air_velocity(t, x, state.S, p, flight, state)
+        advance_states(state.S, x, flight, state)
         for i in range(state.S.shape[0]):
             for q in range(17):
                 call.S[c, i, q] = work.y[6, 17 * i + q]
@@ -465,7 +465,7 @@ def write_samples(t, h, p, flight, state, call):
             call.frame[c, q] = (
                 state.frame[0, q] + (t + x - state.clock[LAW_TIME]) * state.frame[1, q]
             )
-        normalise(call.frame[c])
+        normalise_quaternion(call.frame[c])
         for l in range(call.stamp.shape[1]):
             call.stamp[c, l] = state.mail.stamp[l]
         count[SAMPLES] = c + 1
@@ -526,14 +526,14 @@ def advance_fleet(t, h, p, flight, state):
 
     Returns False, and advances none, if a user's force is not finite.
     """
-    if not find_air(t, h, state.S, p, flight, state):
+    if not find_air_velocity(t, h, state.S, p, flight, state):
         return False
     row, trail = state.count[TRAILED], state.trail
     kept = trail.clock.shape[0] > 0
     if kept:
         trail.clock[row, 0], trail.clock[row, 1] = t, h
         state.count[TRAILED] = row + 1
-    advance(state.S, h, flight, state)
+    advance_states(state.S, h, flight, state)
     for i in range(state.S.shape[0]):
         if not flight.vehicles.lost[i]:
             take_extremes(i, t, h, flight.vehicles, state)

@@ -4,7 +4,7 @@ import math
 
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import jit
-from rigidfleet.solids.distance import outward_normal, own_axes, signed_distance
+from rigidfleet.solids.distance import in_own_axes, outward_normal, signed_distance
 
 #: Greatest number of tangents by which the nearest point of a segment to an obstacle is sought.
 _TANGENTS = 40
@@ -15,7 +15,7 @@ _STEPS = 100
 @jit
 def point_to_obstacle(x, y, z, o, solids, normal):
     """Signed distance [m] of a point from obstacle o, as it stands without motion; writes its gradient (3,)."""
-    x, y, z = own_axes(x, y, z, o, solids)
+    x, y, z = in_own_axes(x, y, z, o, solids)
     u, v, w = outward_normal(x, y, z, o, solids)
     normal[0], normal[1], normal[2] = u, v, w
     if solids.turned[o] != 0:

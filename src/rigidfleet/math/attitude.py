@@ -26,17 +26,17 @@ def dcm_from_quaternion(q: ArrayLike) -> Floats:
 
     The quaternions need not be of unit length. Raises ValueError if one is zero.
     """
-    q = _unit(q)
+    q = _unit_quaternions(q)
     q0, q1, q2, q3 = (q[..., k] for k in range(4))
     rows = [
         [q0**2 + q1**2 - q2**2 - q3**2, 2 * (q1 * q2 + q0 * q3), 2 * (q1 * q3 - q0 * q2)],
         [2 * (q1 * q2 - q0 * q3), q0**2 - q1**2 + q2**2 - q3**2, 2 * (q2 * q3 + q0 * q1)],
         [2 * (q1 * q3 + q0 * q2), 2 * (q2 * q3 - q0 * q1), q0**2 - q1**2 - q2**2 + q3**2],
     ]
-    return _matrices(rows)
+    return _stack_matrices(rows)
 
 
-def _products() -> Floats:
+def _quaternion_products_map() -> Floats:
     """4 q q^T - 1 (4, 4) of a rotation T (3, 3), which is linear in T: the map (9, 16)."""
     N = np.zeros((3, 3, 4, 4))
     for i in range(3):
@@ -51,7 +51,7 @@ def _products() -> Floats:
     return N.reshape(9, 16)
 
 
-_PRODUCTS, _ONE = _products(), np.eye(4)
+_PRODUCTS, _ONE = _quaternion_products_map(), np.eye(4)
 
 
 def quaternion_from_dcm(T: ArrayLike) -> Floats:
@@ -60,9 +60,9 @@ def quaternion_from_dcm(T: ArrayLike) -> Floats:
     Computed from the largest component, so that no small number is a divisor. Raises ValueError if T is
     not a rotation to 1e-6.
     """
-    T = _vectors("T", T, 3, 3)
+    T = _check_vectors("T", T, 3, 3)
     if T.ndim == 2:
-        return np.array(_quaternion(*T.ravel().tolist()))
+        return np.array(_quaternion_of_entries(*T.ravel().tolist()))
     N = (T.reshape(-1, 9) @ _PRODUCTS).reshape(-1, 4, 4) + _ONE  # 4 q q^T
     largest = N.reshape(-1, 16)[:, ::5].argmax(axis=1)
     q = N[np.arange(len(N)), largest]
@@ -80,7 +80,7 @@ _DRIFTED = (
 )
 
 
-def _quaternion(
+def _quaternion_of_entries(
     a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float, i: float
 ) -> tuple[float, float, float, float]:
     """`quaternion_from_dcm` of one T, with rows (a, b, c), (d, e, f), (g, h, i)."""
@@ -102,7 +102,7 @@ def _quaternion(
 
 def dcm_from_euler(euler: ArrayLike) -> Floats:
     """Direction cosines (..., 3, 3) of Euler angles (..., 3) = (roll, pitch, yaw) [rad]."""
-    angles = np.moveaxis(_vectors("euler", euler, 3), -1, 0)
+    angles = np.moveaxis(_check_vectors("euler", euler, 3), -1, 0)
     sr, sp, sy = np.sin(angles)
     cr, cp, cy = np.cos(angles)
     rows = [
@@ -110,7 +110,7 @@ def dcm_from_euler(euler: ArrayLike) -> Floats:
         [sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp],
         [cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp],
     ]
-    return _matrices(rows)
+    return _stack_matrices(rows)
 
 
 def euler_from_dcm(T: ArrayLike) -> Floats:
@@ -119,7 +119,7 @@ def euler_from_dcm(T: ArrayLike) -> Floats:
     Roll and yaw lie in [-pi, pi], pitch in [-pi/2, pi/2]. At pitch = +-90 deg only the sum or
     difference of roll and yaw is defined; roll is then 0. The angles always reproduce T to rounding.
     """
-    T = _vectors("T", T, 3, 3)
+    T = _check_vectors("T", T, 3, 3)
     cos_pitch = np.hypot(T[..., 0, 0], T[..., 0, 1])
     pitch = np.arctan2(-T[..., 0, 2], cos_pitch)
     locked = cos_pitch < 1e-12
@@ -134,7 +134,7 @@ def euler_from_dcm(T: ArrayLike) -> Floats:
 
 def quaternion_from_euler(euler: ArrayLike) -> Floats:
     """Unit quaternions (..., 4) with q0 >= 0 of Euler angles (..., 3) = (roll, pitch, yaw) [rad]."""
-    half = 0.5 * np.moveaxis(_vectors("euler", euler, 3), -1, 0)
+    half = 0.5 * np.moveaxis(_check_vectors("euler", euler, 3), -1, 0)
     sr, sp, sy = np.sin(half)
     cr, cp, cy = np.cos(half)
     q = [
@@ -157,15 +157,15 @@ def quaternion_rate(q: ArrayLike, omega: ArrayLike) -> Floats:
     qdot = 1/2 Omega(omega) q, Eq. (21); the same as 1/2 q (0, omega), and as
     Tdot = -[omega x] T.
     """
-    omega = _vectors("omega", omega, 3)
+    omega = _check_vectors("omega", omega, 3)
     zero = np.zeros((*omega.shape[:-1], 1))
     return 0.5 * quaternion_multiply(q, np.concatenate([zero, omega], axis=-1))
 
 
 def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Floats:
     """Hamilton's product p q (..., 4): T(p q) = T(q) T(p), first p, then q from there."""
-    p0, p1, p2, p3 = np.moveaxis(_vectors("p", p, 4), -1, 0)
-    q0, q1, q2, q3 = np.moveaxis(_vectors("q", q, 4), -1, 0)
+    p0, p1, p2, p3 = np.moveaxis(_check_vectors("p", p, 4), -1, 0)
+    q0, q1, q2, q3 = np.moveaxis(_check_vectors("q", q, 4), -1, 0)
     product = [
         p0 * q0 - p1 * q1 - p2 * q2 - p3 * q3,
         p0 * q1 + p1 * q0 + p2 * q3 - p3 * q2,
@@ -177,7 +177,7 @@ def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Floats:
 
 def quaternion_conjugate(q: ArrayLike) -> Floats:
     """Conjugate (q0, -q1, -q2, -q3) (..., 4): its T is the transpose, body to world."""
-    return _vectors("q", q, 4) * np.array([1.0, -1.0, -1.0, -1.0])
+    return _check_vectors("q", q, 4) * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def unwrap_quaternion(q: ArrayLike) -> Floats:
@@ -185,7 +185,7 @@ def unwrap_quaternion(q: ArrayLike) -> Floats:
 
     The first sample keeps its sign; after a gap of NaN, the last sample before it decides.
     """
-    q = _vectors("q", q, 4)
+    q = _check_vectors("q", q, 4)
     if q.ndim < 2:
         raise ValueError(f"q must be a time series (..., K, 4), not of shape {q.shape}")
     known = ~np.isnan(q).any(axis=-1)
@@ -201,14 +201,14 @@ def angle_between(p: ArrayLike, q: ArrayLike) -> Floats:
 
     Exact to rounding even for small angles, for which an arc cosine loses half of the digits.
     """
-    p, q = _unit(p), _unit(q)
+    p, q = _unit_quaternions(p), _unit_quaternions(q)
     apart, together = np.linalg.norm(p - q, axis=-1), np.linalg.norm(p + q, axis=-1)
     return 4.0 * np.arctan2(np.minimum(apart, together), np.maximum(apart, together))
 
 
 def quaternion_from_rotation_vector(phi: ArrayLike) -> Floats:
     """Unit quaternions (..., 4) of rotation vectors phi (..., 3) [rad]; q0 < 0 beyond half a turn."""
-    phi = _vectors("phi", phi, 3)
+    phi = _check_vectors("phi", phi, 3)
     x = np.linalg.norm(phi, axis=-1, keepdims=True)
     small = x < 1e-4
     ratio = np.where(small, 0.5 - x**2 / 48, np.sin(0.5 * x) / np.where(small, 1.0, x))
@@ -220,7 +220,7 @@ def rotation_vector_from_quaternion(q: ArrayLike) -> Floats:
 
     For half a turn there are two vectors; the one along (q1, q2, q3) is returned.
     """
-    q = _scalar_positive(_unit(q))
+    q = _scalar_positive(_unit_quaternions(q))
     vector = q[..., 1:]
     n = np.linalg.norm(vector, axis=-1, keepdims=True)
     tiny = n == 0.0
@@ -234,7 +234,7 @@ def dcm_from_rotation_vector(phi: ArrayLike) -> Floats:
 
 def rotation_vector_from_dcm(T: ArrayLike) -> Floats:
     """Rotation vectors (..., 3) [rad], at most pi long, of direction cosines (..., 3, 3)."""
-    T = _vectors("T", T, 3, 3)
+    T = _check_vectors("T", T, 3, 3)
     if T.ndim == 2:
         return np.array(vector_of(T))
     return rotation_vector_from_quaternion(quaternion_from_dcm(T))
@@ -242,7 +242,7 @@ def rotation_vector_from_dcm(T: ArrayLike) -> Floats:
 
 def vector_of(T: Floats) -> tuple[float, float, float]:
     """`rotation_vector_from_dcm` of one T (3, 3)."""
-    w, x, y, z = _quaternion(*T.ravel().tolist())
+    w, x, y, z = _quaternion_of_entries(*T.ravel().tolist())
     n = math.sqrt(x * x + y * y + z * z)
     ratio = 2.0 if n == 0.0 else 2.0 * math.atan2(n, w) / n
     return ratio * x, ratio * y, ratio * z
@@ -254,7 +254,7 @@ def rotation_vector_rate(phi: ArrayLike, omega: ArrayLike) -> Floats:
     phi_dot = omega + phi x omega / 2 + k phi x (phi x omega), k = (1 - x/2 cot(x/2))/x^2,
     x = |phi|. It is singular at full turns, x = 2 pi; keep |phi| <= pi.
     """
-    phi, omega = _vectors("phi", phi, 3), _vectors("omega", omega, 3)
+    phi, omega = _check_vectors("phi", phi, 3), _check_vectors("omega", omega, 3)
     with np.errstate(invalid="ignore"):
         rates = _rates(*np.moveaxis(phi, -1, 0), *np.moveaxis(omega, -1, 0))
     return np.stack(rates, axis=-1).astype(np.float64)
@@ -286,7 +286,7 @@ def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Floats:
     z = x cross y. Positions r (..., 3, 3) [m], one row per agent; masses (3,) [kg], equal by
     default. Raises ValueError for agents on a line, for which the recipe has no y axis.
     """
-    r = _vectors("r", r, 3, 3)
+    r = _check_vectors("r", r, 3, 3)
     m = np.ones(3) if masses is None else np.asarray(masses, dtype=float)
     if m.shape != (3,) or not np.all(m > 0):
         raise ValueError(f"masses must be three positive numbers [kg], not {masses!r}")
@@ -306,7 +306,7 @@ def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Floats:
     return np.stack([x, np.cross(z, x), z], axis=-2)
 
 
-def _vectors(name: str, value: ArrayLike, *shape: int) -> Floats:
+def _check_vectors(name: str, value: ArrayLike, *shape: int) -> Floats:
     """Floats of floats whose last axes have this shape."""
     array = np.asarray(value, dtype=float)
     if array.shape[-len(shape) :] != shape:
@@ -315,14 +315,14 @@ def _vectors(name: str, value: ArrayLike, *shape: int) -> Floats:
     return array
 
 
-def _matrices(rows: list[list[Floats]]) -> Floats:
+def _stack_matrices(rows: list[list[Floats]]) -> Floats:
     """Matrices (..., 3, 3) of entries (...)."""
     entries = np.array(rows)
     return np.ascontiguousarray(entries.transpose(*range(2, entries.ndim), 0, 1))
 
 
-def _unit(q: ArrayLike) -> Floats:
-    q = _vectors("q", q, 4)
+def _unit_quaternions(q: ArrayLike) -> Floats:
+    q = _check_vectors("q", q, 4)
     norm = np.sqrt((q * q).sum(axis=-1, keepdims=True))
     if (norm == 0.0).any():
         raise ValueError(

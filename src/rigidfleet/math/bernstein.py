@@ -49,12 +49,12 @@ def greatest_convex_value(points: Floats, size: Callable[[Floats], Floats]) -> G
     greatest at one of them.
     """
 
-    def measure(points: Floats, _: Ints) -> Measured:
+    def measure_size(points: Floats, _: Ints) -> Measured:
         sizes = size(np.moveaxis(points, -1, 1))  # (M, P)
         ends = sizes[:, [0, -1]]
         return ends.max(axis=1), ends.argmax(axis=1).astype(float), sizes.max(axis=1)
 
-    return greatest_by_measure(points, measure, lambda best: _CLOSE * max(abs(best), 1e-3))
+    return greatest_by_measure(points, measure_size, lambda best: _CLOSE * max(abs(best), 1e-3))
 
 
 def greatest_by_measure(

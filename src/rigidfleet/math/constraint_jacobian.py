@@ -76,10 +76,10 @@ def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = N
     if len(r) > some:
         parts = [r[k : k + some] for k in range(0, len(r), some)]
         return np.concatenate([smallest_singular_value(part, edges, masses) for part in parts])
-    return smallest_value(jacobian(r, edges), masses)
+    return least_singular(jacobian(r, edges), masses)
 
 
-def smallest_value(J: Floats, masses: ArrayLike | None = None) -> Floats:
+def least_singular(J: Floats, masses: ArrayLike | None = None) -> Floats:
     """`smallest_singular_value` (K,) of Jacobians J (K, m, 3N), m > 0."""
     if masses is not None:
         m = np.asarray(masses, dtype=float)

@@ -56,7 +56,7 @@ def landing_places(r: Floats, v: Floats, tau: Floats, k: Floats, wind: Floats) -
     return r[..., :2] + v[..., :2] * phi + wind[:2] * (tau[..., None] - phi)
 
 
-def places(r: Floats, v: Floats, time: Floats, k: float, wind: Floats, g: float) -> Floats:
+def fall_places(r: Floats, v: Floats, time: Floats, k: float, wind: Floats, g: float) -> Floats:
     """Places (K, 3) [m] at times (K,) [s] after a vehicle at r, with v (3,), has failed."""
     psi = drag_integrals(np.full(len(time), k), time)[1][:, None]
     return r + v * time[:, None] + psi * (k * (wind - v) - g * np.array([0.0, 0.0, 1.0]))

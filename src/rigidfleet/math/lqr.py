@@ -24,7 +24,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet._common.renamed import earlier_names
+from rigidfleet._common.renamed import getattr_of_earlier_names
 from rigidfleet.math import riccati
 from rigidfleet.typing import Floats
 
@@ -45,7 +45,7 @@ def infinite_horizon(
     x to rest. Raises ValueError if the weights or shapes are wrong, no input brings x to rest, or none
     does so at least cost.
     """
-    A, B, Q, R, N = _system(A, B, Q, R, N)
+    A, B, Q, R, N = _check_system(A, B, Q, R, N)
     F, G, W = _without_cross_weight(A, B, Q, R, N)
     for s in np.linalg.eigvals(A):
         mode = A - s * np.eye(len(A))
@@ -74,7 +74,7 @@ def infinite_horizon(
         )
     # Beyond 40 of the slowest time constants, the cost to go no longer depends on its final value.
     P = riccati.cost_to_go(F, G, W, start, np.array(40.0 / slowest))
-    return riccati.solve(R, B.T @ P + N.T), P
+    return riccati.solve_linear(R, B.T @ P + N.T), P
 
 
 def finite_horizon(
@@ -94,12 +94,12 @@ def finite_horizon(
     P = Phi^T (S^-1 + W)^-1 Phi. Raises ValueError if a time to go is negative, or so long that the cost has
     no minimum; the message says from which time on.
     """
-    A, B, Q, R, N = _system(A, B, Q, R, N)
-    S = _weight("S", S, len(A))
+    A, B, Q, R, N = _check_system(A, B, Q, R, N)
+    S = _weight_matrix("S", S, len(A))
     P = riccati.cost_to_go(
-        *_without_cross_weight(A, B, Q, R, N), S, _times("time_to_go", time_to_go)
+        *_without_cross_weight(A, B, Q, R, N), S, _check_times("time_to_go", time_to_go)
     )
-    return P, riccati.solve(R, B.T @ P + N.T)
+    return P, riccati.solve_linear(R, B.T @ P + N.T)
 
 
 def closed_loop_response(
@@ -123,7 +123,7 @@ def closed_loop_response(
     N = np.zeros(np.shape(B)) if N is None else N
     if x0.shape[:1] != A.shape[:1]:
         raise ValueError(f"x0 must have {len(A)} rows, one per state, not the shape {x0.shape}")
-    x, u = _responses(A, B, Q, R, N, S, T, times)
+    x, u = _unit_responses(A, B, Q, R, N, S, T, times)
     return np.tensordot(x, x0, axes=1), np.tensordot(u, x0, axes=1)
 
 
@@ -133,7 +133,7 @@ def double_integrator_gains(Q: ArrayLike, R: ArrayLike) -> tuple[float, float]:
     In closed form: k1 = sqrt(q1/r), k2 = sqrt(q2/r + 2 k1), for any coupling in Q. Raises ValueError
     unless q1 and q2/r + 2 k1 are positive.
     """
-    _, _, Q, R, _ = _system(_A, _B, Q, R)
+    _, _, Q, R, _ = _check_system(_A, _B, Q, R)
     if not Q[0, 0] > 0.0:
         raise ValueError(
             "an infinite horizon needs a weight on the position, Q[0] > 0: without one, a vehicle"
@@ -164,7 +164,7 @@ def finite_horizon_trajectory(
     per axis. The regulated error is e = x - (x_target + v_target (t - T)). With a final velocity,
     the regulator follows this moving target, not a fixed point.
     """
-    t = _times("times", times)
+    t = _check_times("times", times)
     return trajectory_of_response(double_integrator_response(t, T, Q, R, S), t, start, target, T)
 
 
@@ -177,8 +177,8 @@ def double_integrator_response(
     """
     if S is None:
         # With the cost of an infinite horizon as final weight, the Riccati equation is stationary.
-        S = _cost_at_rest(Q, R)
-    return _responses(_A, _B, Q, R, np.zeros(_B.shape), S, T, times)
+        S = _double_integrator_cost(Q, R)
+    return _unit_responses(_A, _B, Q, R, np.zeros(_B.shape), S, T, times)
 
 
 def trajectory_of_response(
@@ -213,7 +213,7 @@ def infinite_horizon_trajectory(
 
     The target position is that at t = T; for a target at rest, T is only the end of ``times``.
     """
-    t = _times("times", times)
+    t = _check_times("times", times)
     return trajectory_of_response(double_integrator_response(t, T, Q, R, None), t, start, target, T)
 
 
@@ -229,10 +229,10 @@ def knots(
     if not (math.isfinite(T) and T > 0):
         raise ValueError(f"the horizon T must be positive [s], not {T}")
     if S is None:
-        S = _cost_at_rest(Q, R)
-    _, _, Q, R, _ = _system(_A, _B, Q, R)
+        S = _double_integrator_cost(Q, R)
+    _, _, Q, R, _ = _check_system(_A, _B, Q, R)
     fastest = np.abs(
-        np.linalg.eigvals(riccati.hamiltonian(_A, _B @ riccati.solve(R, _B.T), Q))
+        np.linalg.eigvals(riccati.hamiltonian(_A, _B @ riccati.solve_linear(R, _B.T), Q))
     ).max()
     inside = np.array([0.25, 0.5, 0.75])
     powers = np.arange(6)
@@ -251,7 +251,7 @@ def knots(
         largest = np.maximum(largest, np.abs(x).max(axis=(0, 1)))
         # In units of the piece's width, so that one set of powers serves all pieces.
         ends = [z[:, [0, -1]] for z in (x[:, :, 0], width * x[:, :, 1], width**2 * a)]
-        c = _quintics(np.ones(len(left)), *(z.swapaxes(0, 1) for z in ends))
+        c = _quintic_coefficients(np.ones(len(left)), *(z.swapaxes(0, 1) for z in ends))
         quintic = np.stack([c @ u.T, c @ u_dot.T / width], axis=2)
         deviation = quintic - x[:, 1:-1].transpose(0, 3, 2, 1)
         # Rounding of the positions enters the quintic's velocity divided by the width.
@@ -281,10 +281,10 @@ def quintic_pieces(times: ArrayLike, x: ArrayLike, v: ArrayLike, a: ArrayLike) -
             f"x, v and a must have one row for each of the {len(t)} times and the same shape,"
             f" not {x.shape}, {v.shape} and {a.shape}"
         )
-    return _quintics(h, (x[:-1], x[1:]), (v[:-1], v[1:]), (a[:-1], a[1:]))
+    return _quintic_coefficients(h, (x[:-1], x[1:]), (v[:-1], v[1:]), (a[:-1], a[1:]))
 
 
-def _quintics(h: Floats, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
+def _quintic_coefficients(h: Floats, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
     """Coefficients (n, ..., 6) from both ends' (2, n, ...) values, widths h (n,)."""
     (x0, x1), (v0, v1), (a0, a1) = (np.asarray(z) for z in (x, v, a))
     h = h.reshape(-1, *[1] * (x0.ndim - 1))
@@ -296,25 +296,25 @@ def _quintics(h: Floats, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
     return np.stack([*c, (6 * x - 3 * v + 0.5 * a) / h**2], axis=-1)
 
 
-def _responses(
+def _unit_responses(
     A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, N: ArrayLike, S: ArrayLike, T: float, times: ArrayLike
 ) -> Response:  # fmt: skip
     """States (K, n, n) and inputs (K, m, n) from each state alone."""
-    A, B, Q, R, N = _system(A, B, Q, R, N)
-    S = _weight("S", S, len(A))
-    t, T = _times("times", times), float(_times("T", T))
+    A, B, Q, R, N = _check_system(A, B, Q, R, N)
+    S = _weight_matrix("S", S, len(A))
+    t, T = _check_times("times", times), float(_check_times("T", T))
     if t.ndim != 1 or np.any(t > T * (1.0 + 1e-12)):
         raise ValueError(f"times must be a list of times between 0 and T = {T} s")
     P, x = riccati.costs_and_states(*_without_cross_weight(A, B, Q, R, N), S, t, T)
-    return x, -riccati.solve(R, (B.T @ P + N.T) @ x)
+    return x, -riccati.solve_linear(R, (B.T @ P + N.T) @ x)
 
 
-def _cost_at_rest(Q: ArrayLike, R: ArrayLike) -> Floats:
+def _double_integrator_cost(Q: ArrayLike, R: ArrayLike) -> Floats:
     """P (2, 2) of the double integrator's infinite horizon, as `infinite_horizon` has it.
 
     Its Riccati equation has a closed-form solution, which is exact for any weights.
     """
-    _, _, weights, effort, _ = _system(_A, _B, Q, R)
+    _, _, weights, effort, _ = _check_system(_A, _B, Q, R)
     (a, b), (_, d), r = *weights.tolist(), float(effort[0, 0])
     double_integrator_gains(Q, R)  # raises an error if the weights are invalid
     cross = math.sqrt(a) * math.sqrt(r)
@@ -326,17 +326,17 @@ def _without_cross_weight(
     A: Floats, B: Floats, Q: Floats, R: Floats, N: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """The same problem without N, for the input u + R^-1 N^T x: its A, B R^-1 B^T and Q."""
-    G = B @ riccati.solve(R, B.T)
+    G = B @ riccati.solve_linear(R, B.T)
     if not N.any():
         return A, G, Q
-    rest = Q - N @ riccati.solve(R, N.T)
+    rest = Q - N @ riccati.solve_linear(R, N.T)
     value, vector = np.linalg.eigh(0.5 * (rest + rest.T))
     if -riccati.ROUNDING * np.abs(Q).max() <= value[0] < 0.0:  # a zero with rounding error
         value = value.clip(min=0.0)
-    return A - B @ riccati.solve(R, N.T), G, (vector * value) @ vector.T
+    return A - B @ riccati.solve_linear(R, N.T), G, (vector * value) @ vector.T
 
 
-def _system(
+def _check_system(
     A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, N: ArrayLike | None = None
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """A (n, n), B (n, m), Q (n, n), R (m, m) > 0 and N (n, m), checked."""
@@ -350,13 +350,13 @@ def _system(
         raise ValueError(f"N must be {B.shape}, as B is, not {N.shape}")
     if not all(np.all(np.isfinite(M)) for M in (A, B, N)):
         raise ValueError("A, B and N must be finite")
-    R = _weight("R", R, B.shape[1])
+    R = _weight_matrix("R", R, B.shape[1])
     if np.linalg.eigvalsh(R)[0] <= 0.0:
         raise ValueError("R must be positive definite: every input must have a cost")
-    return A, B, _weight("Q", Q, len(A)), R, N
+    return A, B, _weight_matrix("Q", Q, len(A)), R, N
 
 
-def _weight(name: str, value: ArrayLike, n: int) -> Floats:
+def _weight_matrix(name: str, value: ArrayLike, n: int) -> Floats:
     """A symmetric weight (n, n), from it or its diagonal."""
     weight = np.asarray(value, dtype=float)
     if weight.shape == (n,) or (n == 1 and weight.shape == ()):
@@ -372,11 +372,11 @@ def _weight(name: str, value: ArrayLike, n: int) -> Floats:
     return weight
 
 
-def _times(name: str, value: ArrayLike) -> Floats:
+def _check_times(name: str, value: ArrayLike) -> Floats:
     t = np.asarray(value, dtype=float)
     if not np.all(np.isfinite(t)) or np.any(t < 0.0):
         raise ValueError(f"{name} must be finite and not negative [s]")
     return t
 
 
-__getattr__ = earlier_names(__name__, led="trajectory_of_response")
+__getattr__ = getattr_of_earlier_names(__name__, led="trajectory_of_response")

@@ -140,7 +140,7 @@ class LoopGains:
 
 
 @lru_cache
-def overshoot(lag: Lag, laws: LoopGains, drag: float) -> float:
+def overshoot_time(lag: Lag, laws: LoopGains, drag: float) -> float:
     """Time T [s] by which a vehicle that tracks leaves its reference at most, in any direction, under either law.
 
     The reference's acceleration, jerk and snap are fed forward past the attitude control, so that only rotors and the
@@ -188,7 +188,7 @@ class Loop(NamedTuple):
     def gain(self, s: Complexes, law: LoopGains) -> Complexes:
         """L (K, n, n) at s (K,)."""
         each = (..., *(None,) * self.S.ndim)
-        k_u, to_k_c, to_rigid = _gains(s, law)[each]
+        k_u, to_k_c, to_rigid = _gain_parts(s, law)[each]
         K = k_u * np.eye(self.S.shape[-1]) + to_k_c * self.S + to_rigid * self.Q
         G = [lag.response(s, vertical=vertical) / (s * s) for lag, vertical in self.channels]
         if len(G) == 1:
@@ -197,7 +197,7 @@ class Loop(NamedTuple):
         return np.sum([g[each] * part for g, part in zip(G, self.P, strict=True)], axis=0) @ K
 
 
-def _gains(s: Complexes, law: LoopGains) -> Complexes:
+def _gain_parts(s: Complexes, law: LoopGains) -> Complexes:
     """k_u, and what is added to it on S and on rigid motions Q (3, K): K = k_u 1 + ... S + ... Q, because S Q = 0."""
     k_c = 2 * law.alpha * s + law.beta**2 + law.gamma / s
     k_t, k_d = law.k1 + law.k2 * s + law.ki / s, law.k_def * s
@@ -264,7 +264,7 @@ def formation_loops(
     for name, count in (("lags", len(lags)), ("masses", len(m))):
         if count != n:
             raise ValueError(f"{n} agents need {n} {name}, one each, not {count}")
-    S = input_shares(r, np.asarray(edges, dtype=np.int64).reshape(-1, 2), m, law)
+    S = constraint_share_of_input(r, np.asarray(edges, dtype=np.int64).reshape(-1, 2), m, law)
     rigid = rigid_motions(r, m)
     Q = rigid @ rigid.T
     kinds = [(lag, axis == 2 and not lag.point) for lag in lags for axis in range(3)]
@@ -293,7 +293,7 @@ def tracking_loops(lags: Sequence[Lag]) -> list[Loop]:
     return [Loop(zero, zero, one, (kind,)) for kind in kinds]
 
 
-def input_shares(r: Floats, edges: Ints, m: Floats, law: LoopGains) -> Floats:
+def constraint_share_of_input(r: Floats, edges: Ints, m: Floats, law: LoopGains) -> Floats:
     """S (3N, 3N): the law's share of the input, with nearly equal filter factors made equal."""
     if not len(edges):
         return np.zeros((r.size, r.size))
@@ -356,10 +356,10 @@ def _connected_components(joined: Bools) -> list[Ints]:
 
 def is_stable(loops: Sequence[Loop], law: LoopGains, growth: float = GROWTH) -> bool:
     """Whether no motion grows at a rate of ``growth`` [1/s] > 0 or more: Nyquist's criterion on det(1 + L)."""
-    return all(_is_stable(part, law, growth) for part in _by_size(loops))
+    return all(_is_stable(part, law, growth) for part in _stack_by_size(loops))
 
 
-def _by_size(loops: Sequence[Loop]) -> Iterator[Loop]:
+def _stack_by_size(loops: Sequence[Loop]) -> Iterator[Loop]:
     """The loops of each size, small ones first, as one: most are small, and what is done with each takes longer."""
     for n in sorted({len(loop.S) for loop in loops}):
         some = [loop for loop in loops if len(loop.S) == n]
@@ -414,7 +414,7 @@ def _top_frequency(loop: Loop, law: LoopGains, size: float) -> float:
     omega = np.geomspace(*_FREQUENCIES, 600)
     s = 1j * omega
     each = np.abs([lag.response(s, vertical=vertical) for lag, vertical in loop.channels])
-    k_u, to_k_c, to_rigid = np.abs(_gains(s, law))
+    k_u, to_k_c, to_rigid = np.abs(_gain_parts(s, law))
     K = k_u + to_k_c + to_rigid  # the norms of S and Q are at most 1
     above = np.flatnonzero(each.max(axis=0) * K > size * omega**2)
     return float(omega[min(above[-1] + 1, len(omega) - 1)]) if len(above) else 0.0
@@ -424,13 +424,13 @@ def _eigenvalues(A: Complexes) -> Complexes:
     return A[..., 0] if A.shape[-1] == 1 else np.linalg.eigvals(A)
 
 
-def margins(loops: Sequence[Loop], law: LoopGains, growth: float = GROWTH) -> Margins:
+def stability_margins(loops: Sequence[Loop], law: LoopGains, growth: float = GROWTH) -> Margins:
     """Gain, phase and delay margin common to all loops: the smallest of them; ``growth`` as in `is_stable`."""
     if not is_stable(loops, law, growth):
         return Margins(stable=False)
     low, high, phase, delay = 0.0, math.inf, math.pi, math.inf
     for loop in loops:
-        omega, loci, on_axis = _crossings(loop, law)
+        omega, loci, on_axis = _locus_crossings(loop, law)
         gain = 1.0 / np.abs(loci[on_axis])
         high = min(high, gain[gain > 1].min(initial=math.inf))
         low = max(low, gain[gain <= 1].max(initial=0.0))
@@ -440,7 +440,7 @@ def margins(loops: Sequence[Loop], law: LoopGains, growth: float = GROWTH) -> Ma
     return Margins(True, (float(low), float(high)), float(phase), float(delay))
 
 
-def _crossings(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes, Bools]:
+def _locus_crossings(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes, Bools]:
     """Frequencies (M,) [rad/s] where a locus is negative real or has unit gain; the loci there; which are real."""
     omega, loci = _loci(loop, law)
     # Numbers of log(locus) that are whole where a locus is negative real, and that change sign at unit gain.

@@ -44,8 +44,8 @@ class Piecewise(NamedTuple):
     def of_bernstein(cls, time: Floats, points: Floats) -> Piecewise:
         """From control points (K, ..., P) between knots (K + 1,) [s]."""
         powers = points.shape[-1]
-        scaled = np.linalg.solve(_to_bernstein(powers), points[..., None])[..., 0]
-        return cls(time, scaled / _widths(time, points) ** np.arange(powers))
+        scaled = np.linalg.solve(_bernstein_matrix(powers), points[..., None])[..., 0]
+        return cls(time, scaled / _piece_widths(time, points) ** np.arange(powers))
 
     @classmethod
     def cubic_spline(cls, time: Floats, x: Floats) -> Piecewise:
@@ -62,20 +62,20 @@ class Piecewise(NamedTuple):
         pieces = windows @ CUBIC * (spans / duration) ** np.arange(4.0)
         return cls(np.linspace(0.0, duration, spans + 1), pieces)
 
-    def series(self, t: Floats, orders: int) -> Floats:
+    def taylor_coefficients(self, t: Floats, orders: int) -> Floats:
         """Taylor coefficients (orders, T, ...) at times (T,) [s]."""
-        k = piece_at(self.time, t)
+        k = piece_index(self.time, t)
         return series.of_polynomials(_take_pieces(self.pieces, k), t - self.time[k], orders)
 
     def at(self, t: Floats) -> Floats:
         """Values (T, ...) at times (T,) [s]."""
-        return self.series(t, 1)[0]
+        return self.taylor_coefficients(t, 1)[0]
 
     def states(self, t: Floats, orders: int) -> Floats:
         """Value and derivatives (orders, T, ...) at times (T,) [s]."""
-        return series.derivatives(self.series(t, orders))
+        return series.derivatives(self.taylor_coefficients(t, orders))
 
-    def ends(self, orders: int) -> tuple[Floats, Floats]:
+    def states_at_ends(self, orders: int) -> tuple[Floats, Floats]:
         """Value and derivatives (orders, K, ...) at the beginning and at the end of each piece."""
         times = np.zeros(len(self.pieces)), np.diff(self.time)
         begin, end = (series.of_polynomials(self.pieces, t, orders) for t in times)
@@ -88,7 +88,7 @@ class Piecewise(NamedTuple):
         values = series.of_polynomials(each, after.ravel(), 1)[0]
         return values.reshape(*after.shape, *values.shape[1:])
 
-    def rate(self) -> Piecewise:
+    def derivative_curve(self) -> Piecewise:
         """Its derivative; of constants, no power is left."""
         return Piecewise(self.time, self.pieces[..., 1:] * np.arange(1.0, self.pieces.shape[-1]))
 
@@ -98,7 +98,7 @@ class Piecewise(NamedTuple):
         begin = series.of_polynomials(self.pieces[1:], np.zeros(len(self.pieces) - 1), orders)
         return series.derivatives(begin - end)
 
-    def later(self, start: float) -> Piecewise:
+    def shift_time(self, start: float) -> Piecewise:
         """The same, begun later [s]."""
         return Piecewise(self.time + start, self.pieces)
 
@@ -111,7 +111,7 @@ class Piecewise(NamedTuple):
             return self
         middle = 0.5 * (knots[:-1] + knots[1:])
         begin = np.clip(knots[:-1], self.time[0], self.time[-1]) if stays else knots[:-1]
-        k = piece_at(self.time, middle)
+        k = piece_index(self.time, middle)
         pieces = expand_about(_take_pieces(self.pieces, k), begin - self.time[k])
         if stays:
             pieces[(middle < self.time[0]) | (middle > self.time[-1]), ..., 1:] = 0.0
@@ -121,7 +121,7 @@ class Piecewise(NamedTuple):
         """The same with further knots at times that lie inside, further ``apart`` [s] from any of its own."""
         return self.refine(refine_knots(self.time, times, apart))
 
-    def part(self, first: int, last: int) -> Piecewise:
+    def slice_pieces(self, first: int, last: int) -> Piecewise:
         """The pieces from a first one to before a last one."""
         pieces = self.pieces[first:last]
         return Piecewise(self.time[first : first + len(pieces) + 1], pieces)
@@ -157,8 +157,8 @@ class Piecewise(NamedTuple):
     def control_points(self) -> Floats:
         """Control points (K, ..., P), in whose hull each piece lies."""
         powers = self.pieces.shape[-1]
-        scaled = self.pieces * _widths(self.time, self.pieces) ** np.arange(powers)
-        return scaled @ _to_bernstein(powers).T
+        scaled = self.pieces * _piece_widths(self.time, self.pieces) ** np.arange(powers)
+        return scaled @ _bernstein_matrix(powers).T
 
 
 def hermite_pieces(h: Floats, begin: Floats, end: Floats) -> Floats:
@@ -168,11 +168,11 @@ def hermite_pieces(h: Floats, begin: Floats, end: Floats) -> Floats:
     scale = np.stack([h**k for k in range(2 * m)])
     start = series.from_derivatives(begin) * scale[:m]  # coefficients in u = (t - t0) / h
     reached = [sum(start[k] * float(perm(k, j)) for k in range(j, m)) for j in range(m)]
-    rest = np.tensordot(_to_highest(m), end * scale[:m] - np.stack(reached), 1)
+    rest = np.tensordot(_matrix_to_highest(m), end * scale[:m] - np.stack(reached), 1)
     return np.moveaxis(np.concatenate([start, rest]) / scale, 0, -1)
 
 
-def piece_at(knots: Floats, t: Floats, side: Literal["left", "right"] = "right") -> Ints:
+def piece_index(knots: Floats, t: Floats, side: Literal["left", "right"] = "right") -> Ints:
     """Interval (T,) between knots (K + 1,) in which times (T,) are; beyond the ends, the first and the last.
 
     At a knot, it is the one after it ("right") or before it ("left").
@@ -184,7 +184,7 @@ def piece_at(knots: Floats, t: Floats, side: Literal["left", "right"] = "right")
 def refine_knots(knots: Floats, times: Floats, apart: float = 0.0) -> Floats:
     """Knots with further ones at times that lie inside, further ``apart`` [s] from any of them."""
     inside = times[(times > knots[0]) & (times < knots[-1])]
-    k = piece_at(knots, inside)
+    k = piece_index(knots, inside)
     far = np.minimum(inside - knots[k], knots[k + 1] - inside)
     return np.union1d(knots, inside[far > apart])
 
@@ -197,7 +197,7 @@ def common_knots(curves: Sequence[Piecewise]) -> Floats:
     return knots
 
 
-def join(curves: Sequence[Piecewise], most: float = np.inf) -> Piecewise:
+def join_curves(curves: Sequence[Piecewise], most: float = np.inf) -> Piecewise:
     """N curves as one (K, N, ..., P) on their `common_knots`; each stays where it begins and ends.
 
     Raises
@@ -241,12 +241,12 @@ def expand_about(pieces: Floats, x: Floats) -> Floats:
     return np.moveaxis(series.of_polynomials(pieces, x, pieces.shape[-1]), 0, -1)
 
 
-def _widths(time: Floats, pieces: Floats) -> Floats:
+def _piece_widths(time: Floats, pieces: Floats) -> Floats:
     return np.diff(time).reshape(-1, *(1,) * (pieces.ndim - 1))
 
 
 @cache
-def _to_highest(m: int) -> Floats:
+def _matrix_to_highest(m: int) -> Floats:
     """From the m derivatives that lack at the end of a piece of unit length to its m highest coefficients.
 
     It is the inverse of the rows k! / (k - j)! of u^k at u = 1, whose entries are whole sixths for m up to 4.
@@ -256,7 +256,7 @@ def _to_highest(m: int) -> Floats:
 
 
 @cache
-def _to_bernstein(powers: int) -> Floats:
+def _bernstein_matrix(powers: int) -> Floats:
     """The matrix of control points b_i = sum_k C(i, k) / C(P - 1, k) a_k of a piece on [0, 1]."""
     return np.array(
         [[comb(i, k) / comb(powers - 1, k) for k in range(powers)] for i in range(powers)]

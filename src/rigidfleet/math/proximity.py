@@ -131,7 +131,7 @@ def _closest_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
             apart = near.separations(p)
             at = int(apart.argmin())
         if near is None or apart[at] > near.beyond - 2.0 * _greatest_move(rest, p):
-            near, rest = _near(p, radius), p
+            near, rest = _pairs_near_least(p, radius), p
             apart = near.separations(p)
             at = int(apart.argmin())
         least[k], pair[k] = apart[at], near.pairs[:, at]
@@ -153,7 +153,7 @@ class _Near(NamedTuple):
         return np.sqrt(x[0] + x[1] + x[2]) - self.radii
 
 
-def _near(p: Floats, radius: Floats) -> _Near:
+def _pairs_near_least(p: Floats, radius: Floats) -> _Near:
     """The pairs of agents p (3, N) that are not much farther apart than the closest two."""
     from scipy.spatial import KDTree
 
@@ -344,9 +344,9 @@ def distances(
     Points farther than ``most`` may have infinity, too.
     """
     if solid.moves:
-        shift = distance.displacement(np.asarray(time, dtype=float).T, 0, solid)
+        shift = distance.solid_displacement(np.asarray(time, dtype=float).T, 0, solid)
         x, y, z = x - shift[0], y - shift[1], z - shift[2]
-    x, y, z = distance.own_axes(x, y, z, 0, solid)
+    x, y, z = distance.in_own_axes(x, y, z, 0, solid)
     if solid.kind[0] in _SURFACES:
         away = np.full(x.shape, np.inf)
         near = np.flatnonzero((distance.box_distance(x, y, z, solid.size[0]) < most).reshape(-1))

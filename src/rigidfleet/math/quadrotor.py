@@ -65,7 +65,7 @@ def flat(force: Floats, yaw: Floats) -> Flat:
         along the heading's normal
     yaw : (K, 3): yaw [rad] and its derivatives
     """
-    z, thrust = _directions(force)
+    z, thrust = _unit_vectors(force)
     psi, rate, second = yaw.T
     cos, sin, none = np.cos(psi), np.sin(psi), np.zeros(len(psi))
     heading = np.empty_like(force)
@@ -74,22 +74,22 @@ def flat(force: Floats, yaw: Floats) -> Flat:
     heading[:, 2] = np.stack(
         [-cos * rate**2 - sin * second, -sin * rate**2 + cos * second, none], axis=1
     )
-    y, _ = _directions(_cross(z, heading))
-    x = _cross(y, z)
+    y, _ = _unit_vectors(_cross_with_derivatives(z, heading))
+    x = _cross_with_derivatives(y, z)
 
-    def rates(a: Floats, b: Floats) -> tuple[Floats, Floats]:
+    def dot_with_rate(a: Floats, b: Floats) -> tuple[Floats, Floats]:
         """a . b', and its derivative."""
         along = np.einsum("ki,ki->k", a[:, 0], b[:, 1])
         turn = np.einsum("ki,ki->k", a[:, 1], b[:, 1]) + np.einsum("ki,ki->k", a[:, 0], b[:, 2])
         return along, turn
 
     # R^T R' = [omega x], column by column
-    parts = [rates(z, y), rates(x, z), rates(y, x)]
+    parts = [dot_with_rate(z, y), dot_with_rate(x, z), dot_with_rate(y, x)]
     omega, omega_dot = (np.stack(column, axis=1) for column in zip(*parts, strict=True))
     return Flat(thrust, np.stack([x[:, 0], y[:, 0], z[:, 0]], axis=2), omega, omega_dot)
 
 
-def _directions(v: Floats) -> tuple[Floats, Floats]:
+def _unit_vectors(v: Floats) -> tuple[Floats, Floats]:
     """Unit vectors of v (K, 3, 3), a vector and two derivatives, with theirs; and the length of v (K,)."""
     size = np.linalg.norm(v[:, 0], axis=1)
     u = np.empty_like(v)
@@ -102,7 +102,7 @@ def _directions(v: Floats) -> tuple[Floats, Floats]:
     return u, size
 
 
-def _cross(a: Floats, b: Floats) -> Floats:
+def _cross_with_derivatives(a: Floats, b: Floats) -> Floats:
     """Cross product of two vectors with two derivatives, (K, 3, 3) each."""
     x, y = (series.from_derivatives(v.swapaxes(0, 1)) for v in (a, b))
     return series.derivatives(series.product(x, y, np.cross)).swapaxes(0, 1)

@@ -32,7 +32,7 @@ def cost_to_go(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Float
     Raises ValueError if P does not exist at all times to go until the greatest, or cannot be computed.
     """
     grows = _needs_small_steps(A, G, Q, S, tau.max(initial=0.0))
-    return _by_marching(A, G, Q, S, tau)[0] if grows else _by_doubling(A, G, Q, S, tau)
+    return _march_costs(A, G, Q, S, tau)[0] if grows else _costs_by_doubling(A, G, Q, S, tau)
 
 
 def costs_and_states(
@@ -44,18 +44,18 @@ def costs_and_states(
     """
     tau = np.maximum(T - t, 0.0)
     if _needs_small_steps(A, G, Q, S, T):
-        P, x = (part[:-1] for part in _by_marching(A, G, Q, S, np.append(tau, T)))
+        P, x = (part[:-1] for part in _march_costs(A, G, Q, S, np.append(tau, T)))
         return P, x
-    P = _by_doubling(A, G, Q, S, tau)
-    X, Phi, W, _ = _flow(A, G, Q, S, t, T)
-    return P, solve(np.eye(len(A)) + W @ (P - X), Phi)
+    P = _costs_by_doubling(A, G, Q, S, tau)
+    X, Phi, W, _ = _hamiltonian_flow(A, G, Q, S, t, T)
+    return P, solve_linear(np.eye(len(A)) + W @ (P - X), Phi)
 
 
-def _by_doubling(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
+def _costs_by_doubling(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
     """P (..., n, n) at times to go tau (...), from the flow of `_propagate`."""
-    X, Phi, W, V = _flow(A, G, Q, S, tau, tau.max(initial=0.0))
+    X, Phi, W, V = _hamiltonian_flow(A, G, Q, S, tau, tau.max(initial=0.0))
     D = S - X
-    P = X + V + _transpose(Phi) @ solve(np.eye(len(A)) + D @ W, D @ Phi)
+    P = X + V + _transpose(Phi) @ solve_linear(np.eye(len(A)) + D @ W, D @ Phi)
     return 0.5 * (P + _transpose(P))
 
 
@@ -78,7 +78,7 @@ def _needs_small_steps(A: Floats, G: Floats, Q: Floats, S: Floats, T: float) -> 
     return not float(np.abs(Phi).max()) <= _GROWTH  # true for NaN
 
 
-def _by_marching(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tuple[Floats, Floats]:
+def _march_costs(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tuple[Floats, Floats]:
     """P and x (..., n, n) at times to go tau (...), in steps that each keep P positive.
 
     Columns of x are the states that each state alone, at the greatest time to go, leads to. Raises ValueError if there
@@ -95,8 +95,8 @@ def _by_marching(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tup
         while left:
             value, vector = np.linalg.eigh(P)
             root = vector * np.sqrt(value.clip(min=0.0))
-            closed, reach = solve(identity + W @ P, Phi), root.T @ Phi
-            last, P = P, V + reach.T @ solve(identity + root.T @ W @ root, reach)
+            closed, reach = solve_linear(identity + W @ P, Phi), root.T @ Phi
+            last, P = P, V + reach.T @ solve_linear(identity + root.T @ W @ root, reach)
             P = 0.5 * (P + P.T)
             # At a stationary P, all further steps are the same.
             done = left if np.abs(P - last).max() <= np.finfo(float).eps * np.abs(P).max() else 1
@@ -116,7 +116,7 @@ def _by_marching(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tup
     return np.array(costs)[where], np.array(states[::-1])[where]
 
 
-def _flow(
+def _hamiltonian_flow(
     A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats, T: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """X (n, n) and Phi, W, V (..., n, n) over tau (...), as `_propagate` has them of P - X.
@@ -168,7 +168,7 @@ def solution_by_subspace(H: Floats) -> Floats:
             " finite horizon"
         )
     vectors = schur(balanced, sort="lhp")[1][:, :n] * scale[:, None]
-    P = solve(vectors[:n].T, vectors[n:].T)
+    P = solve_linear(vectors[:n].T, vectors[n:].T)
     return 0.5 * (P + P.T)
 
 
@@ -202,7 +202,7 @@ def _propagate(
         term = term @ step / k
         E = E + term
     # D = Phi - 1 in place of Phi: squaring a matrix near 1 doubles its rounding error each time.
-    D = -solve(identity + E[..., :n, :n], E[..., :n, :n])
+    D = -solve_linear(identity + E[..., :n, :n], E[..., :n, :n])
     W = E[..., :n, n:] + D @ E[..., :n, n:]
     V = E[..., n:, :n] + E[..., n:, :n] @ D
     escaped, watched = np.zeros(tau.shape, dtype=bool), not is_semidefinite(Q)
@@ -217,7 +217,7 @@ def _propagate(
             more &= ~escaped
         d, w, v = D[more], W[more], V[more]
         phi, wv = identity + d, w @ v
-        turn = solve(identity + wv, np.concatenate([wv, w @ _transpose(phi)], axis=-1))
+        turn = solve_linear(identity + wv, np.concatenate([wv, w @ _transpose(phi)], axis=-1))
         loss, reach = turn[..., :n], turn[..., n:]
         D[more] = 2.0 * d + d @ d - phi @ loss @ phi
         W[more] = w + phi @ reach
@@ -230,7 +230,7 @@ def hamiltonian(A: Floats, G: Floats, Q: Floats) -> Floats:
     return np.block([[A, -G], [-Q, -A.T]])
 
 
-def solve(M: Floats, b: Floats) -> Floats:
+def solve_linear(M: Floats, b: Floats) -> Floats:
     """M^-1 b, of stacks of matrices, too."""
     return np.linalg.solve(M, b).astype(float, copy=False)
 

@@ -37,7 +37,7 @@ def _factorials(x: Floats) -> Floats:
     return _FACTORIALS[: len(x)].reshape(-1, *(1,) * (x.ndim - 1))
 
 
-def rate(x: Floats) -> Floats:
+def differentiate(x: Floats) -> Floats:
     """The series of x', one order shorter."""
     return x[1:] * np.arange(1.0, len(x)).reshape(-1, *(1,) * (x.ndim - 1))
 
@@ -71,7 +71,7 @@ def product(
     return total
 
 
-def rotation(phi: Floats, orders: int | None = None) -> Floats:
+def rotation_series(phi: Floats, orders: int | None = None) -> Floats:
     """Series (n, ..., 3, 3) of R = Exp(phi), body to world, of rotation vectors phi (n, ..., 3) [rad].
 
     With fewer ``orders``, the others are left out, and the numbers are the same.
@@ -94,7 +94,7 @@ def rotation(phi: Floats, orders: int | None = None) -> Floats:
     return R.transpose(0, *range(3, R.ndim), 1, 2)
 
 
-def rotation_vector(R: Floats) -> Floats:
+def rotation_vector_series(R: Floats) -> Floats:
     """Series (n, ..., 3) of rotation vectors phi [rad], R = Exp(phi), of rotations (n, ..., 3, 3); |phi| < pi.
 
     The inverse of `rotation`, order by order: coefficient k of R contains that of phi as R [J_r(phi) phi_k x], and
@@ -103,12 +103,12 @@ def rotation_vector(R: Floats) -> Floats:
     phi = np.zeros(R.shape[:-1])
     phi[0] = att.rotation_vector_from_dcm(np.swapaxes(R[0], -1, -2))
     for k in range(1, len(R)):
-        lacking = R[k] - rotation(phi[: k + 1])[k] if k > 1 else R[k]  # nothing moves yet
+        lacking = R[k] - rotation_series(phi[: k + 1])[k] if k > 1 else R[k]  # nothing moves yet
         phi[k] = att.rotation_vector_rate(phi[0], _axial(np.swapaxes(R[0], -1, -2) @ lacking))
     return phi
 
 
-def from_rates(R: Floats, omega: Floats) -> Floats:
+def rotation_series_from_rates(R: Floats, omega: Floats) -> Floats:
     """Series (n + 1, ..., 3, 3) of a rotation that is R (..., 3, 3), body to world, at body rates omega (n, ..., 3)."""
     W, terms = cross_matrix(omega), [R]
     for k in range(len(omega)):  # R' = R [omega x]
@@ -116,19 +116,19 @@ def from_rates(R: Floats, omega: Floats) -> Floats:
     return np.stack(terms)
 
 
-def body_rates(R: Floats) -> Floats:
+def body_rates_series(R: Floats) -> Floats:
     """Series (n - 1, ..., 3) of the rates [rad/s] in body axes of rotations R (n, ..., 3, 3), body to world."""
-    return _axial(product(np.swapaxes(R, -1, -2)[:-1], rate(R), np.matmul))
+    return _axial(product(np.swapaxes(R, -1, -2)[:-1], differentiate(R), np.matmul))
 
 
-def angle(y: Floats, x: Floats) -> Floats:
+def angle_series(y: Floats, x: Floats) -> Floats:
     """Series of atan2(y, x) [rad]; derivatives where y and x vanish are zero."""
     angles = np.zeros_like(x)
     angles[0] = np.arctan2(y[0], x[0])
     size = x[0] ** 2 + y[0] ** 2
     safe = np.where(size > 0.0, size, np.inf)
     turned, square = (
-        product(x[:-1], rate(y)) - product(y[:-1], rate(x)),
+        product(x[:-1], differentiate(y)) - product(y[:-1], differentiate(x)),
         product(x, x) + product(y, y),
     )
     rates = np.zeros_like(turned)  # angle' (x^2 + y^2) = x y' - y x'
@@ -180,7 +180,7 @@ def _stumpff_series(u: Floats, count: int) -> tuple[Floats, Floats, Floats]:
 
     c_k' = (k c_(k+2) - c_(k+1)) / 2 gives each order from the order before of the following functions.
     """
-    n, slope = len(u), rate(u)
+    n, slope = len(u), differentiate(u)
     orders = [_stumpff(u[0], count)]
     chain: list[Floats] = []  # derivatives by u
     for order in range(1, n):

@@ -88,15 +88,15 @@ class Smoothed:
     @property
     def way(self) -> Piecewise:
         """The likely way: pieces (M, 3, 5)."""
-        return spline(self.knots, self.points)
+        return spline_of_points(self.knots, self.points)
 
     def draw(self, count: int, random: np.random.Generator) -> Floats:
         """Control points (M + 4, 3, count) of ways as likely as the true one, given the samples."""
         normal = random.standard_normal((len(self.points), 3 * count))
-        return self.points[..., None] + _draws(self.factor, normal).reshape(-1, 3, count)
+        return self.points[..., None] + _draw_normals(self.factor, normal).reshape(-1, 3, count)
 
 
-def spline(knots: Floats, points: Floats) -> Piecewise:
+def spline_of_points(knots: Floats, points: Floats) -> Piecewise:
     """The spline with control points (M + 4, ...) on even knots (M + 1,) [s]: pieces (M, ..., 5)."""
     h, spans = knots[1] - knots[0], len(knots) - 1
     windows = np.stack([points[k : k + spans] for k in range(_POINTS)], axis=-1)
@@ -158,7 +158,7 @@ def smooth(
     numbers, about = 3 * max(len(samples.time) - 3, 1), np.zeros((count, 3))
     third = np.zeros((whole, 3))  # differences of ``about``
 
-    def solve(weight: Floats) -> tuple[Floats, Floats, Floats]:
+    def solve_points(weight: Floats) -> tuple[Floats, Floats, Floats]:
         """Control points from ``about`` on (C, 3), what they were solved of, and the factor."""
         full, of = band.copy(), right.copy()
         for i in range(4):
@@ -170,7 +170,7 @@ def smooth(
 
     def evaluate(log_variance: float) -> tuple[float, float]:
         weight = calm * np.exp(-log_variance)
-        points, of, factor = solve(weight)
+        points, of, factor = solve_points(weight)
         quadratic = squares + float((weight @ third**2).sum())
         quadratic = max(quadratic - float((points * of).sum()), 1e-12 * squares)
         of_points = 2.0 * float(np.log(factor[0]).sum()) + whole * log_variance
@@ -181,7 +181,7 @@ def smooth(
     zero = 0.0 if free else 2.0 * np.log(noise.sigma)  # in units of the noise, where it is known
     bounds = _SMALLEST + zero, _LARGEST + zero
     # Only what a first way leaves is fitted: of far positions, the quadratic would be all rounding.
-    about = solve(calm * np.exp(-_FIRST - zero))[0]
+    about = solve_points(calm * np.exp(-_FIRST - zero))[0]
     third = np.diff(about, 3, axis=0)
     value = value - matrix @ about
     squares, right = float((value**2).sum()), matrix.T @ value
@@ -191,13 +191,13 @@ def smooth(
     weight = calm * np.exp(-best.x)
     random = np.random.default_rng(0)
     for _ in range(turns):
-        points, _, factor = solve(weight)
-        drawn = _draws(factor, random.standard_normal((count, _DRAWN)))
+        points, _, factor = solve_points(weight)
+        drawn = _draw_normals(factor, random.standard_normal((count, _DRAWN)))
         size = (np.diff(about + points, 3, axis=0) ** 2).sum(axis=1)
         size = size / variance + 3.0 * (np.diff(drawn, 3, axis=0) ** 2).mean(axis=1)
         weight = (_FREEDOM + 3.0) / (_FREEDOM / weight.mean() + size)
         weight = np.minimum(weight, np.exp(-bounds[0]))
-    points, _, factor = solve(weight)
+    points, _, factor = solve_points(weight)
     sigma = float(np.sqrt(variance))
     residual = (value - matrix @ points) / sigma
     known = PositionNoise(sigma * unit.sigma, noise.tau)
@@ -205,7 +205,7 @@ def smooth(
     return Smoothed(knots, about + points, factor / sigma, calm, known, deviance, residual)
 
 
-def _draws(factor: Floats, normal: Floats) -> Floats:
+def _draw_normals(factor: Floats, normal: Floats) -> Floats:
     """Normal numbers (C, ...) with the precision of a banded Cholesky factor."""
     from scipy.linalg import get_lapack_funcs
 
@@ -221,7 +221,7 @@ class NoiseEstimate(NamedTuple):
     words: str
 
 
-def noise_of(vehicles: Sequence[Positions], sigma: float | None, step: float) -> NoiseEstimate:
+def fit_noise(vehicles: Sequence[Positions], sigma: float | None, step: float) -> NoiseEstimate:
     """The noise of some vehicles alike: of a stated standard deviation [m], or else of one that they show themselves.
 
     Knots are a ``step`` [s] apart, or as rare as samples. The correlation time is the likeliest. Without a stated size
@@ -239,13 +239,13 @@ def noise_of(vehicles: Sequence[Positions], sigma: float | None, step: float) ->
     size = np.nan if sigma is None else sigma
     calm = [smooth(own, PositionNoise(size), k).calm for own, k in zip(some, knots, strict=True)]
 
-    def fit(tau: float) -> tuple[float, list[Smoothed]]:
+    def fit_at_correlation(tau: float) -> tuple[float, list[Smoothed]]:
         parts = zip(some, knots, calm, strict=True)
         every = [smooth(own, PositionNoise(size, tau), k, each) for own, k, each in parts]
         return sum(each.deviance for each in every), every
 
     taus = [0.0, *np.geomspace(0.5 * usual, _SLOWEST, _TAUS).tolist()]
-    fits = [fit(tau) for tau in taus]
+    fits = [fit_at_correlation(tau) for tau in taus]
     deviances = [deviance for deviance, _ in fits]
     k = int(np.argmin(deviances))
     if deviances[0] < deviances[k] + _CLEAR:
@@ -257,7 +257,7 @@ def noise_of(vehicles: Sequence[Positions], sigma: float | None, step: float) ->
         by = 0.5 * (before - after) / (before - 2.0 * here + after) if before > here else 0.0
         ratio = taus[-1] / taus[-2]
         tau = tau * ratio ** float(np.clip(by, -0.5, 0.5))
-        every = fit(tau)[1]
+        every = fit_at_correlation(tau)[1]
     size = float(np.median([each.noise.sigma for each in every]))
     residual = np.concatenate([each.residual for each in every])
     lags = [abs((residual[j:] * residual[:-j]).mean()) for j in range(1, _LAGS + 1)]

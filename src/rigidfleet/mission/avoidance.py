@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet.mission.disturbances import intensity
+from rigidfleet.mission.disturbances import gust_intensity
 from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.schema import Avoidance, Disturbances
-from rigidfleet.mission.vehicles import NOT_SAMPLED, VehicleModel, resolve
+from rigidfleet.mission.vehicles import NOT_SAMPLED, VehicleModel, model_of_vehicle
 from rigidfleet.typing import Floats
 
 _TABLE = "avoidance"
@@ -21,7 +21,7 @@ _SIGMAS = 3.0
 _LEFT_OUT = 0.02
 
 
-def braking_accelerations(
+def spare_accelerations(
     models: Sequence[VehicleModel], gravity: float, disturbances: Disturbances | None
 ) -> Floats:
     """Acceleration (N,) [m/s^2] that each vehicle has left in any direction, negative if none.
@@ -47,7 +47,7 @@ def _disturbing_accelerations(
         return np.zeros(len(models))
     wind = float(np.linalg.norm(disturbances.wind))
     if disturbances.gusts is not None:
-        wind += _SIGMAS * float(np.linalg.norm(intensity(disturbances.gusts, wind)))
+        wind += _SIGMAS * float(np.linalg.norm(gust_intensity(disturbances.gusts, wind)))
     error = np.broadcast_to(np.array(disturbances.mass_error, dtype=float), len(models))
     by_wind = [
         (max(model.linear_drag) + max(model.body_drag) * wind) * wind / model.mass
@@ -106,7 +106,7 @@ def extra_radii(
     return own + (0.0 if noise is None else _SIGMAS * noise.position)
 
 
-def why_unproved(
+def why_no_guarantee(
     models: Sequence[VehicleModel], d: Disturbances | None, obstacles: Sequence[Any] = ()
 ) -> str:
     """Why the guard's guarantee is no theorem for these vehicles and obstacles; empty if it is one."""
@@ -127,7 +127,7 @@ def why_unproved(
     return ""
 
 
-def rules(m: Draft) -> Breaches:
+def avoidance_rules(m: Draft) -> Breaches:
     """[avoidance] acts, knows what it needs to know, and leaves vehicles something to brake with."""
     a, d = m.avoidance, m.disturbances
     if a is None:
@@ -152,8 +152,8 @@ def rules(m: Draft) -> Breaches:
     if m.agents is None or m.findings:
         return
     names = m.agents.vehicle
-    models = [resolve(m.vehicles[name]) for name in names]
-    left = braking_accelerations(models, m.gravity, d)
+    models = [model_of_vehicle(m.vehicles[name]) for name in names]
+    left = spare_accelerations(models, m.gravity, d)
     for name in dict.fromkeys(names):
         i, where = names.index(name), ("vehicles", name, "thrust_limit")
         if math.isinf(left[i]):

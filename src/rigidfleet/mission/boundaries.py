@@ -85,7 +85,7 @@ class Boundaries:
         self.g = mission.gravity
         kind_of = [fence.kind for fence in mission.fences]
         self.every = [
-            _Boundary("people", k, partial(self._falls, region), CLOSE_FALL)
+            _Boundary("people", k, partial(self._nearness_of_falls, region), CLOSE_FALL)
             for k, region in areas_of(mission, "people")
         ] + [
             _Boundary(name, k, partial(_distance_outside, region, kind_of[k] == "inclusion"), CLOSE)
@@ -103,13 +103,13 @@ class Boundaries:
         ranks, number = np.reshape(values, (len(own), *r.shape[:2])), [x.number for x in own]
         return QUANTITIES[quantity].rank(ranks.max(axis=0)), np.array(number)[ranks.argmax(axis=0)]
 
-    def landings(self, r: Floats, v: Floats, level: Floats | float) -> Floats:
+    def places_of_falls(self, r: Floats, v: Floats, level: Floats | float) -> Floats:
         """Where vehicles fall to levels [m] that fail at states (K, N, 3): places (K, N, 2) [m]."""
         k = np.broadcast_to(self.k, r.shape[:2])
         tau = falls.fall_time(r[..., 2] - level, v[..., 2], k, self.wind[2], self.g)
         return falls.landing_places(r, v, tau, k, self.wind)
 
-    def ends(self, r: Floats, v: Floats) -> Floats:
+    def ends_of_falls(self, r: Floats, v: Floats) -> Floats:
         """Where these falls end (K, N, 3) [m]: on the ground, or at z = 0 without one.
 
         Terrain and roofs count at some heights of each fall.
@@ -119,26 +119,26 @@ class Boundaries:
         terrain = [np.array(x.heights).min() for x in mission.solids if x.kind == "heights"]
         level = min([level, *terrain])
         ends = np.full(r.shape, level)
-        ends[..., :2] = self.landings(r, v, level)
+        ends[..., :2] = self.places_of_falls(r, v, level)
         for share in np.linspace(0.0, 1.0, _HEIGHTS) if mission.roofs.kind.size else ():
             height = level + share * (r[..., 2] - level)
-            x, y = np.moveaxis(self.landings(r, v, height), 2, 0)
+            x, y = np.moveaxis(self.places_of_falls(r, v, height), 2, 0)
             above = mission.height_at(x, y) >= height
             ends[above] = np.stack([x, y, height], axis=2)[above]
         return ends
 
-    def _falls(self, region: Region, points: Floats, who: Ints) -> Measured:
+    def _nearness_of_falls(self, region: Region, points: Floats, who: Ints) -> Measured:
         """How near people falls from curves (M, 6, P) of agents (M,) go: minus distances [m], see `Measure`."""
         levels = np.linspace(region.ceiling, region.floor, _LEVELS)
         m, k = curve_middles(points)[..., None], self.k[who][:, None]
         low, high = points.min(axis=2)[..., None], points.max(axis=2)[..., None]
 
-        def times(x: Floats) -> Floats:
+        def fall_times(x: Floats) -> Floats:
             height, climb, drag = np.broadcast_arrays(x[:, 2] - levels, x[:, 5], k)
             return falls.fall_time(height, climb, drag, self.wind[2], self.g)
 
-        tau = times(m)
-        first, last = (tau, tau) if points.shape[2] == 1 else (times(low), times(high))
+        tau = fall_times(m)
+        first, last = (tau, tau) if points.shape[2] == 1 else (fall_times(low), fall_times(high))
         off = (points - m)[:, [0, 1, 3, 4]].reshape(len(m), 2, 2, -1)
         spread = np.linalg.norm(off, axis=2).max(axis=2)
         place = falls.landing_places(m[:, None, :3, 0], m[:, None, 3:, 0], tau, k, self.wind)
@@ -148,17 +148,17 @@ class Boundaries:
         early = np.maximum(last - tau, tau - first)
         reach = spread[:, :1] + spread[:, 1:] * falls.drag_integrals(k, last)[0] + speed * early
 
-        def least(away: Floats, way: Floats) -> Floats:
+        def least_nearness(away: Floats, way: Floats) -> Floats:
             return 0.5 * (away[:, 1:] + away[:, :-1] - way).min(axis=1)
 
         way = speed * np.diff(tau, axis=1)
         more = (speed + spread[:, 1:]) * (np.diff(tau, axis=1) + early[:, 1:] + early[:, :-1])
-        return -least(away, way), np.full(len(m), 0.5), -least(away - reach, more)
+        return -least_nearness(away, way), np.full(len(m), 0.5), -least_nearness(away - reach, more)
 
 
 def _distance_outside(region: Region, inclusion: bool, points: Floats, _: Ints) -> Measured:
     """How far curves (M, 6, P) are on the wrong side of a fence [m], see `Measure`."""
-    value, bound = region.depth(points[:, :3], outside=inclusion)
+    value, bound = region.depths_of_curves(points[:, :3], outside=inclusion)
     return value, np.full(len(value), 0.5), bound
 
 
@@ -193,8 +193,8 @@ class BoundaryWatch:
         left = np.ones(n, dtype=np.bool_) if left is None else left
         some = max(1, _TOGETHER // n)
         for k in range(0, len(way.pieces), some):
-            part = way.part(k, k + some)
-            both = part, part.rate()
+            part = way.slice_pieces(k, k + some)
+            both = part, part.derivative_curve()
             points = [Piecewise(x.time, pad(x.pieces, powers)).control_points() for x in both]
             clock = np.column_stack([part.time[:-1], np.diff(part.time)])
             self.take_steps(clock, np.concatenate(points, axis=2), left)
@@ -226,7 +226,7 @@ class BoundaryWatch:
             if start.max() > least:
                 k = int(start.argmax())
                 least = float(start[k])
-                self._keep(x, least, float(clock[starts[k // len(agents)], 0]), int(every[k]))
+                self._keep_worst(x, least, float(clock[starts[k // len(agents)], 0]), int(every[k]))
             near = (x.measure(boxes, every)[2] > least + x.close).reshape(len(starts), -1)
             step, who = np.nonzero(np.repeat(near, _BOXED, axis=0)[: len(clock)])
 
@@ -238,8 +238,8 @@ class BoundaryWatch:
             peak = greatest_by_measure(points[step, who], measure, lambda _, x=x: x.close, least)
             if peak.curve >= 0:
                 t, h = clock[step[peak.curve]].tolist()
-                self._keep(x, peak.value, t + peak.place * h, int(agents[who[peak.curve]]))
+                self._keep_worst(x, peak.value, t + peak.place * h, int(agents[who[peak.curve]]))
 
-    def _keep(self, x: _Boundary, rank: float, when: float, who: int) -> None:
+    def _keep_worst(self, x: _Boundary, rank: float, when: float, who: int) -> None:
         value = float(QUANTITIES[x.quantity].rank(rank))
         self.worst[x.quantity] = Worst(value, when, who, x.number)

@@ -8,7 +8,7 @@ from rigidfleet.mission.kinds import Go, Phase
 from rigidfleet.mission.schema import Formation
 
 
-def with_own_names(
+def split_shared_formations(
     formations: Mapping[str, Formation], phases: Sequence[Phase]
 ) -> tuple[dict[str, Formation], tuple[Phase, ...]]:
     """Formations and phases in which no formation is taken on two ways that need different slots.
@@ -45,7 +45,7 @@ def with_own_names(
     return known, tuple(renamed)
 
 
-def with_scales(
+def add_scaled_formations(
     formations: Mapping[str, Formation], phases: Sequence[Phase], n: int
 ) -> dict[str, Formation]:
     """Formations with those added that phases of kind "go" may shrink: "NAME x 0.8"."""

@@ -31,7 +31,7 @@ from rigidfleet.mission import (
 )
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys, look_up, model_of, suggest_shape
-from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key
+from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key_rules
 from rigidfleet.mission.schema import Agents, Contents, MissionHeader, Regulator, Start, Tracking
 
 #: Models of the single tables. Obstacles, phases, fences and people are arrays of tables.
@@ -44,7 +44,7 @@ _TABLES = {
 
 
 @cache
-def defaults() -> dict[str, Any]:
+def default_tables() -> dict[str, Any]:
     """What a mission has for tables that are not given: immutable, and the same for all missions."""
     fields = Contents.model_fields.items()
     return {
@@ -54,7 +54,7 @@ def defaults() -> dict[str, Any]:
     }
 
 
-def checked_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
+def check_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     """Check the data of a mission and return its parts, by the fields of `Contents`.
 
     Raises
@@ -62,32 +62,32 @@ def checked_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     MissionError
         With a finding for each error.
     """
-    m = Draft(data, origin, defaults())
-    m.n = _count(data)
-    m.record_breaches((), _sizes(m))
+    m = Draft(data, origin, default_tables())
+    m.n = _count_agents(data)
+    m.record_breaches((), _size_rules(m))
     if m.findings:  # the other checks would take long
         raise MissionError(m.findings)
-    _tables(m)
+    _validate_tables(m)
     for path, rules in (
-        (("agents",), _agents),
-        (("constraint",), _gains),
-        (("lqr",), _regulators),
-        (("tracking",), _tracking),
-        (("allocation",), _allocation),
-        (("limits",), _limits),
-        (("yaw",), _yaw),
-        ((), _obstacles),
-        ((), _areas),
-        (("formations",), formations.rules),
-        ((), _touching),
-        ((), phases.rules),
-        (("disturbances",), disturbances.rules),
-        (("network",), network.rules),
-        ((), losses.rules),
-        (("disturbances",), disturbances.sizes),
-        ((), vehicles.flight_rules),
-        (("agents", "fixed"), _fixed_agents),
-        ((), avoidance.rules),
+        (("agents",), _agent_rules),
+        (("constraint",), _gain_rules),
+        (("lqr",), _regulator_rules),
+        (("tracking",), _tracking_rules),
+        (("allocation",), _allocation_rules),
+        (("limits",), _limit_rules),
+        (("yaw",), _yaw_rules),
+        ((), _all_obstacle_rules),
+        ((), _all_area_rules),
+        (("formations",), formations.formation_rules),
+        ((), _touching_pair_rules),
+        ((), phases.phase_rules),
+        (("disturbances",), disturbances.disturbance_rules),
+        (("network",), network.network_rules),
+        ((), losses.loss_rules),
+        (("disturbances",), disturbances.disturbance_size_rules),
+        ((), vehicles.vehicle_flight_rules),
+        (("agents", "fixed"), _fixed_agent_rules),
+        ((), avoidance.avoidance_rules),
     ):
         m.record_breaches(path, rules(m))
     if m.findings:
@@ -95,7 +95,7 @@ def checked_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     return m.parts
 
 
-def _sizes(m: Draft) -> Breaches:
+def _size_rules(m: Draft) -> Breaches:
     """Counts beyond the bounds, before anything else is checked."""
     agents, forms = m.data.get("agents"), m.data.get("formations")
     lists: list[tuple[Keys, int, str]] = [
@@ -126,7 +126,7 @@ def _sizes(m: Draft) -> Breaches:
         yield Breach("assignment", problem, remedy)
 
 
-def _tables(m: Draft) -> None:
+def _validate_tables(m: Draft) -> None:
     """Validate the keys of the header and the tables; invalid ones are left out."""
     for key in m.data:
         if key not in Contents.model_fields:
@@ -139,14 +139,14 @@ def _tables(m: Draft) -> None:
         if key in m.data:
             data = m.data[key]
             if key == "agents":
-                data = vehicles.fleet_table(m, _with_points(m, data))
+                data = vehicles.fill_agents_table(m, _fill_start_points(m, data))
             part = None if data is None else m.validate(kind, data, (key,))
             m.parts |= {} if part is None else {key: part}
     if "agents" not in m.data:
         m.add(("agents",), "is missing", "add a table [agents] with mass and position")
 
 
-def _with_points(m: Draft, agents: Any) -> Any:
+def _fill_start_points(m: Draft, agents: Any) -> Any:
     """Return [agents] with a shape of `position` replaced by its points; None if the shape has errors."""
     path, position = ("agents", "position"), look_up(agents, ("position",))
     if isinstance(position, str):
@@ -172,7 +172,7 @@ def _with_points(m: Draft, agents: Any) -> Any:
     return agents | {"position": points.tolist()}
 
 
-def _count(data: Mapping[str, Any]) -> int | None:
+def _count_agents(data: Mapping[str, Any]) -> int | None:
     """Number of agents; None if it is not known."""
     position = look_up(data, ("agents", "position"))
     if isinstance(position, dict):
@@ -182,7 +182,7 @@ def _count(data: Mapping[str, Any]) -> int | None:
     return len(position) if isinstance(position, list) and position else None
 
 
-def _agents(m: Draft) -> Breaches:
+def _agent_rules(m: Draft) -> Breaches:
     """One entry per agent, apart from each other, with numbers that go together."""
     agents: Agents | None = m.agents
     if agents is None:
@@ -207,12 +207,12 @@ def _agents(m: Draft) -> Breaches:
         yield Breach("saturate", "no limit to saturate at is given", "give thrust_limit [N]")
 
 
-def _fixed_agents(m: Draft) -> Breaches:
+def _fixed_agent_rules(m: Draft) -> Breaches:
     """Fixed agents exist, and nothing is to move them or to change what they hold."""
     if m.findings or not m.agents.fixed:
         return
     agents, d = m.agents, m.disturbances
-    yield from phases.agents_exist_once(m, agents.fixed)
+    yield from phases.named_agent_rules(m, agents.fixed)
     lost = d is not None and d.lost
     n, solver = len(agents.position), m.constraint.solver
     for wrong, problem, remedy in (
@@ -225,7 +225,7 @@ def _fixed_agents(m: Draft) -> Breaches:
             yield Breach((), problem, remedy)
 
 
-def _touching(m: Draft) -> Breaches:
+def _touching_pair_rules(m: Draft) -> Breaches:
     """No radii so large that a list of all touching pairs would fill memory."""
     n = m.n
     if m.findings or n is None or n * (n - 1) // 2 <= bounds.TOUCHING:
@@ -247,7 +247,7 @@ def _touching(m: Draft) -> Breaches:
             return
 
 
-def _gains(m: Draft) -> Breaches:
+def _gain_rules(m: Draft) -> Breaches:
     """The feedback of constraints is stable."""
     c = m.constraint
     if c.stabilisation == "none":
@@ -272,7 +272,7 @@ _NO_WEIGHT = 1e-12
 _FREE = 1e-15
 
 
-def _regulators(m: Draft) -> Breaches:
+def _regulator_rules(m: Draft) -> Breaches:
     """The regulators of the virtual body act, with gains that are bounded."""
     keys = ("horizon", "Q", "S")
     for weights, below in ((m.lqr, ()), (m.lqr.attitude, ("attitude",))):
@@ -290,10 +290,10 @@ def _regulators(m: Draft) -> Breaches:
                 yield Breach((*below, "S"), problem, remedy, weights.S)
         if m.is_valid(("lqr",), "R") and m.is_valid(path, "R"):
             inherited = look_up(m.data, (*path, "R")) is None
-            yield from _bounded_gains(weights, () if inherited else below, ".".join(path))
+            yield from _bounded_gain_rules(weights, () if inherited else below, ".".join(path))
 
 
-def _bounded_gains(weights: Regulator | Tracking, below: Keys, name: str) -> Breaches:
+def _bounded_gain_rules(weights: Regulator | Tracking, below: Keys, name: str) -> Breaches:
     """R is large enough beside the other weights."""
     most = max(*weights.Q, *getattr(weights, "S", ()))
     if _FREE * most > weights.R:
@@ -301,38 +301,38 @@ def _bounded_gains(weights: Regulator | Tracking, below: Keys, name: str) -> Bre
         yield Breach((*below, "R"), problem, f"raise R or lower the weights of {name}", weights.R)
 
 
-def _tracking(m: Draft) -> Breaches:
+def _tracking_rules(m: Draft) -> Breaches:
     """Tracking acts, with gains that are bounded."""
     if m.tracking.Q[0] < _NO_WEIGHT:
         problem = f"tracking needs a weight of at least {_NO_WEIGHT:g} on the position error"
         yield Breach("Q", problem, "for example, give Q = [4.0, 4.0]")
     if m.is_valid(("tracking",), "Q"):
-        yield from _bounded_gains(m.tracking, (), "tracking")
+        yield from _bounded_gain_rules(m.tracking, (), "tracking")
 
 
-def _allocation(m: Draft) -> Breaches:
+def _allocation_rules(m: Draft) -> Breaches:
     """The torque is divided by the method that divides it."""
     if m.is_valid(("allocation",), "method"):
-        yield from idle_key(m.allocation, "torque_split", "method", "pinv")
+        yield from idle_key_rules(m.allocation, "torque_split", "method", "pinv")
 
 
-def _limits(m: Draft) -> Breaches:
+def _limit_rules(m: Draft) -> Breaches:
     """Limits have an effect."""
     limits = m.limits
     if limits.geofence is not None:
-        yield from _corners(limits.geofence, ("geofence",))
+        yield from _corner_rules(limits.geofence, ("geofence",))
     if limits.separation_altitude is not None and limits.separation is None:
         problem = "has no effect without separation"
         yield Breach("separation_altitude", problem, "remove it or add separation")
     jerks = (q.name for q in MOTIONS if q.order == 3)
     # Of vehicles, the verdict judges the tilt.
     for key in jerks if m.flies_vehicles else (*jerks, "tilt_deg"):
-        if getattr(limits, key) is not None and not m.smooth:
+        if getattr(limits, key) is not None and not m.is_smooth:
             problem = "has no effect: only the plan of a smooth mission keeps it"
             yield Breach(key, problem, "remove it or add smoothness = 'jerk' at the top")
 
 
-def _yaw(m: Draft) -> Breaches:
+def _yaw_rules(m: Draft) -> Breaches:
     """The yaw of vehicles has what its kind needs, and no more."""
     yaw = m.yaw
     if not m.is_valid(("yaw",), "kind", "yaw_deg", "point"):
@@ -341,10 +341,10 @@ def _yaw(m: Draft) -> Breaches:
         remedy = "add point: the point to look at, [x, y, z] [m]"
         yield Breach("point", "is missing", remedy)
     for key, kind in (("yaw_deg", "fixed"), ("point", "towards")):
-        yield from idle_key(yaw, key, "kind", kind)
+        yield from idle_key_rules(yaw, key, "kind", kind)
 
 
-def _corners(box: Any, below: Keys) -> Breaches:
+def _corner_rules(box: Any, below: Keys) -> Breaches:
     """The lowest corner of a box is below the highest."""
     for axis, low, high in zip("xyz", box.min, box.max, strict=True):
         if low >= high:
@@ -352,7 +352,7 @@ def _corners(box: Any, below: Keys) -> Breaches:
             yield Breach(below, problem, "swap them", None)
 
 
-def _obstacles(m: Draft) -> Breaches:
+def _all_obstacle_rules(m: Draft) -> Breaches:
     """Each obstacle by itself."""
     things = []
     for k, data in enumerate(m.tables("obstacles")):
@@ -361,21 +361,21 @@ def _obstacles(m: Draft) -> Breaches:
             continue
         name = "ground" if kind is obstacles.Ground else f"{data['kind']} {k + 1}"
         if (thing := m.validate(kind, data, path, {"name": name})) is not None:
-            m.record_breaches(path, obstacles.rules(m, thing, path))
+            m.record_breaches(path, obstacles.obstacle_rules(m, thing, path))
             if isinstance(thing, obstacles.Box):
-                yield from _corners(thing, path)
+                yield from _corner_rules(thing, path)
             things.append(thing)
     m.parts["obstacles"] = tuple(things)
 
 
-def _areas(m: Draft) -> Breaches:
+def _all_area_rules(m: Draft) -> Breaches:
     """Each fence, and each place with people, by itself."""
     for table, (kind, word) in fences.TABLES.items():
         areas = []
         for k, data in enumerate(m.tables(table)):
             path = (table, k)
             if (area := m.validate(kind, data, path, {"name": f"{word} {k + 1}"})) is not None:
-                m.record_breaches(path, fences.rules(m, area, path))
+                m.record_breaches(path, fences.area_rules(m, area, path))
                 areas.append(area)
         m.parts[table] = tuple(areas)
     if m.people and m.is_valid((), "gravity") and m.gravity < 1.0:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key
+from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key_rules
 from rigidfleet.mission.schema import Disturbances, Gusts
 from rigidfleet.mission.vehicles import NOT_SAMPLED
 from rigidfleet.typing import Floats
@@ -33,7 +33,7 @@ def gust_step(gusts: Gusts, wind: float) -> float:
     return min(shortest / _KNOTS, _STEP)
 
 
-def intensity(gusts: Gusts, wind: float) -> Floats:
+def gust_intensity(gusts: Gusts, wind: float) -> Floats:
     """Standard deviations (3,) of gusts [m/s]: along a steady wind of a given speed [m/s], across it, and vertical."""
     if gusts.intensity is None:
         from rigidfleet.math.turbulence import low_altitude_gusts
@@ -42,7 +42,7 @@ def intensity(gusts: Gusts, wind: float) -> Floats:
     return np.broadcast_to(np.array(gusts.intensity, dtype=np.float64), 3)
 
 
-def rules(m: Draft) -> Breaches:
+def disturbance_rules(m: Draft) -> Breaches:
     """Disturbances have one entry per agent, and an effect."""
     d: Disturbances | None = m.disturbances
     if d is None:
@@ -54,7 +54,7 @@ def rules(m: Draft) -> Breaches:
         problem = "without drag, wind and gusts have no effect"
         yield Breach("drag", problem, "give a drag > 0 [N s/m] or omit it")
     if d.gusts is not None and m.is_valid(_GUSTS, "model"):
-        m.record_breaches(_GUSTS, _gusts(m, d.gusts, any(d.wind)))
+        m.record_breaches(_GUSTS, _gust_rules(m, d.gusts, any(d.wind)))
     noise, keys = d.noise, ("position", "velocity", "delay", "dropped")
     silent = noise is not None and not any(getattr(noise, key) for key in keys)
     if silent and m.is_valid((_TABLE, "noise"), *keys):
@@ -69,14 +69,14 @@ def rules(m: Draft) -> Breaches:
             yield Breach(("noise", key), *NOT_SAMPLED)
 
 
-def _gusts(m: Draft, gusts: Gusts, wind: bool) -> Breaches:
+def _gust_rules(m: Draft, gusts: Gusts, wind: bool) -> Breaches:
     """Gusts have the keys of their model, and no others."""
     spread = "add the standard deviation of the gusts [m/s]"
     if gusts.model == "first-order":
         if gusts.time_scale is None:
             yield Breach("time_scale", "is missing", "add the correlation time of the gusts [s]")
         for key in ("length", "altitude", "airspeed"):
-            yield from idle_key(gusts, key, "model", "dryden")
+            yield from idle_key_rules(gusts, key, "model", "dryden")
         if gusts.intensity is None:
             yield Breach("intensity", "is missing", spread)
     else:
@@ -102,7 +102,7 @@ def _gusts(m: Draft, gusts: Gusts, wind: bool) -> Breaches:
         yield Breach("correlation_length", problem, remedy)
 
 
-def sizes(m: Draft) -> Breaches:
+def disturbance_size_rules(m: Draft) -> Breaches:
     """Tables of gusts and noise fit into memory."""
     d: Disturbances | None = m.disturbances
     if d is None or m.end is None or m.n is None or m.findings:

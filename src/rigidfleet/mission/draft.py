@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigidfleet._common.renamed import earlier_names
+from rigidfleet._common.renamed import getattr_of_earlier_names
 from rigidfleet._common.templates import templates
 from rigidfleet.formation import distance_geometry, shapes
 from rigidfleet.math import proximity
@@ -83,7 +83,7 @@ def draft(
     slots = shapes.slots(shape, list(size), n)
     nearest = float(proximity.nearest(slots).min()) if n > 1 else SIZE
     radius = min(RADIUS, nearest / 4)
-    start, below = _start(slots, min(_APART, nearest))
+    start, below = _start_positions(slots, min(_APART, nearest))
     low = float(-slots[:, 2].min()) + radius
     height = max(5.0, math.ceil(np.ptp(slots[:, 2]) + 3.0))
     if waypoints is None:
@@ -100,19 +100,19 @@ def draft(
     if not below:  # some agents cross the whole shape
         way = float(np.linalg.norm(np.ptp(np.vstack([slots, start - centre]), axis=0)))
     blend = max(4, blend_time(way))
-    climb, flights = _time(aloft - centre), _waypoint_durations(aloft, waypoints)
+    climb, flights = _flight_duration(aloft - centre), _waypoint_durations(aloft, waypoints)
     lasts = climb + blend + _SETTLE + sum(time for _, time in flights) + _HOLD
     limit = math.ceil(LIFT * mass * 9.81) if thrust_limit is None else thrust_limit
     extent = json.dumps([float(x) for x in size]) if len(size) > 1 else f"{size[0]:g}"
     text = templates("rigidfleet.mission", escape=False).get_template("mission.toml").render(
         name=json.dumps(name, ensure_ascii=False), file=file or f"{name}.toml",
         title=f"{n} vehicles fly as a {shape}" if n > 1 else "One vehicle flies",
-        mass=f"{mass:g}", start=[_row(place) for place in start], below=below, step=output_step(n, lasts),
+        mass=f"{mass:g}", start=[_toml_row(place) for place in start], below=below, step=output_step(n, lasts),
         radius=f"{radius:.3g}", thrust=f"{limit:g}", shape=shape, size=extent, many=n > _ALL_PAIRS,
         takes=shapes.agents_taken(shape), text=shapes.SHAPES[shape].text, separation=f"{min(0.5, nearest / 6):.3g}",
         # In a small spatial shape, or one of many agents, some agents pass below others in any case.
         warned=below and (distance_geometry.dimension(slots) < 3 or nearest >= 3.0),
-        aloft=_row(aloft), climb=climb, blend=blend, settle=_SETTLE, flights=flights, hold=_HOLD,
+        aloft=_toml_row(aloft), climb=climb, blend=blend, settle=_SETTLE, flights=flights, hold=_HOLD,
     )  # fmt: skip
     return align_comments(text)
 
@@ -136,7 +136,7 @@ def agents_for(shape: str) -> int:
     return usual.get(shape, taken.start)
 
 
-def _start(slots: Floats, apart: float) -> tuple[Floats, bool]:
+def _start_positions(slots: Floats, apart: float) -> tuple[Floats, bool]:
     """Return start positions (N, 3) [m] on the ground, and whether each is below its slot.
 
     Where slots lie above each other, agents start on a grid, or few on a line.
@@ -169,12 +169,12 @@ def _waypoint_durations(at: Floats, waypoints: Sequence[Sequence[float]]) -> lis
     flights = []
     for waypoint in waypoints:
         to = np.asarray(waypoint, dtype=float)
-        flights.append((_row(to), _time(to - at)))
+        flights.append((_toml_row(to), _flight_duration(to - at)))
         at = to
     return flights
 
 
-def _time(way: Floats) -> int:
+def _flight_duration(way: Floats) -> int:
     """Duration [s] of a rest-to-rest flight by a vector (3,) [m] that keeps to `_SPEED` and `_ACCELERATION`."""
     return max(4, blend_time(float(np.linalg.norm(way))))
 
@@ -185,9 +185,9 @@ def align_comments(text: str) -> str:
     return beside.sub(lambda m: f"{m[1]:<{_COLUMN - 1}} # {m[2]}", text)
 
 
-__getattr__ = earlier_names(__name__, aligned="align_comments")
+__getattr__ = getattr_of_earlier_names(__name__, aligned="align_comments")
 
 
-def _row(values: Sequence[float] | Floats) -> str:
+def _toml_row(values: Sequence[float] | Floats) -> str:
     # Adding zero removes the sign of a negative zero.
     return f"[{', '.join(f'{round(float(x), 3) + 0.0:g}' for x in values)}]"

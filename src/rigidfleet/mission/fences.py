@@ -64,12 +64,12 @@ class Area(Part):
             return [[np.array(ring) for ring in (self.polygon or (), *self.holes)]]
         place = origin.latitude_deg, origin.longitude_deg, origin.altitude
 
-        def metres(ring: Any) -> Floats:
+        def ring_in_metres(ring: Any) -> Floats:
             longitude, latitude = np.array(ring).T
             level = np.full(len(ring), origin.altitude)
             return enu_of(np.column_stack([latitude, longitude, level]), place)[:, :2]
 
-        return [[metres(ring) for ring in rings] for rings in self.coordinates]
+        return [[ring_in_metres(ring) for ring in rings] for rings in self.coordinates]
 
     def rings(self, origin: Any) -> list[Floats]:
         """Borders and holes of all polygons."""
@@ -77,9 +77,9 @@ class Area(Part):
 
     def region(self, origin: Any, ground: float) -> Region:
         """The area between its heights; ``ground`` [m] is where people stand."""
-        return Region.of_rings(self.rings(origin), *self.heights(ground))
+        return Region.of_rings(self.rings(origin), *self.height_span(ground))
 
-    def heights(self, ground: float) -> tuple[float, float]:
+    def height_span(self, ground: float) -> tuple[float, float]:
         """Floor and ceiling [m]."""
         del ground
         floor = -math.inf if self.floor is None else self.floor
@@ -102,7 +102,7 @@ class Fence(Area):
 class People(Area):
     """A place where people are: without heights, from the ground, or z = 0 without one, to two metres above it."""
 
-    def heights(self, ground: float) -> tuple[float, float]:
+    def height_span(self, ground: float) -> tuple[float, float]:
         """Floor and ceiling [m]."""
         floor = (ground if math.isfinite(ground) else 0.0) if self.floor is None else self.floor
         return floor, floor + _TALL if self.ceiling is None else self.ceiling
@@ -115,7 +115,7 @@ TABLES: dict[str, tuple[type[Area], str]] = {
 }
 
 
-def rules(m: Draft, area: Area, path: Keys) -> Breaches:
+def area_rules(m: Draft, area: Area, path: Keys) -> Breaches:
     """An area is given once, by corners that bound one, and has heights in order."""
     ways = [name for name in ("polygon", "coordinates", "file") if getattr(area, name) is not None]
     if area.file is not None:
@@ -130,18 +130,18 @@ def rules(m: Draft, area: Area, path: Keys) -> Breaches:
     elif ways:
         if area.holes and area.polygon is None:
             yield Breach("holes", "has no effect without polygon", "put holes into coordinates")
-        if why := flaw(area.polygons(m.geodetic_origin)):
+        if why := polygon_flaw(area.polygons(m.geodetic_origin)):
             yield Breach(ways[0], *why, None)
     terrain = any(x.kind == "heights" for x in m.obstacles)
     if isinstance(area, People) and area.floor is None and terrain:
         remedy = "give the floor and the ceiling of the terrain there, and two metres more"
         yield Breach("floor", "is missing: people stand on terrain", remedy, None)
-    floor, ceiling = area.heights(-math.inf)
+    floor, ceiling = area.height_span(-math.inf)
     if floor > ceiling:
         yield Breach("ceiling", f"is below the floor, {floor:g} m", "give a greater height")
 
 
-def flaw(polygons: Sequence[Sequence[Floats]]) -> tuple[str, str] | None:
+def polygon_flaw(polygons: Sequence[Sequence[Floats]]) -> tuple[str, str] | None:
     """What is wrong with polygons of rings (m, 2) [m], and the remedy; None if they bound an area."""
     rings = [ring for polygon in polygons for ring in polygon]
     corners = np.concatenate(rings)
@@ -156,7 +156,7 @@ def flaw(polygons: Sequence[Sequence[Floats]]) -> tuple[str, str] | None:
     if edges_cross(edges):
         return "has edges that cross", "give the corners in their order; polygons may not overlap"
 
-    if any(_width(ring) < _NARROW for ring in rings):
+    if any(_mean_width(ring) < _NARROW for ring in rings):
         return "bounds no area: its corners lie on a line", "give corners around it"
     areas = [Region.of_rings([ring]) for ring in rings]
     some = [ring[:: max(1, len(ring) // _SOME)] for ring in rings]  # all are on the same side
@@ -172,7 +172,7 @@ def flaw(polygons: Sequence[Sequence[Floats]]) -> tuple[str, str] | None:
     return None
 
 
-def _width(ring: Floats) -> float:
+def _mean_width(ring: Floats) -> float:
     """The area of a ring (m, 2) over half of its length [m]."""
     (x, y), (x1, y1) = ring.T, np.roll(ring, -1, axis=0).T
     return float(abs((x * y1 - y * x1).sum()) / np.hypot(x1 - x, y1 - y).sum())

@@ -52,7 +52,7 @@ class Content(NamedTuple):
     notes: Sequence[str] = ()
 
 
-def with_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, Any], str]:
+def fill_in_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, Any], str]:
     """A mission in which numbers stand instead of the names of files, with the SHA-256 digest of each in its text.
 
     That text is written anew, without comments.
@@ -68,7 +68,7 @@ def with_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, A
         A file is outside the folder, cannot be read, or has not the numbers asked for.
     """
     digests = []
-    for named in list(_files_named(data)):
+    for named in list(_entries_with_files(data)):
         from rigidfleet.formation.point_files import read_bytes
 
         name = named.table[named.key]
@@ -127,7 +127,7 @@ def _file_error(name: str, where: str, error: TrajectoryError) -> MissionError:
     return MissionError([Finding(name, where, None, problem, "")])
 
 
-def _files_named(data: dict[str, Any]) -> Iterator[_Named]:
+def _entries_with_files(data: dict[str, Any]) -> Iterator[_Named]:
     forms, agents, things, phases = (
         data.get(key) for key in ("formations", "agents", "obstacles", "phases")
     )

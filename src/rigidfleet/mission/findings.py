@@ -211,14 +211,14 @@ def _model_at(owner: type[Part], key: object) -> type[Part]:
 
 def model_of(annotation: Any) -> type[Part] | None:
     """First model in an annotation such as `Settle | None`; None if there is none."""
-    return next(_models(annotation), None)
+    return next(_models_in_annotation(annotation), None)
 
 
-def _models(annotation: Any) -> Iterator[type[Part]]:
+def _models_in_annotation(annotation: Any) -> Iterator[type[Part]]:
     """Iterate over the models in an annotation such as `Settle | None` or `tuple[Lost, ...]`."""
     if get_origin(annotation) in (Union, UnionType, Annotated, tuple):
         for choice in get_args(annotation):
-            yield from _models(choice)
+            yield from _models_in_annotation(choice)
     elif isinstance(annotation, type) and issubclass(annotation, Part):
         yield annotation
 
@@ -233,7 +233,7 @@ def _problem_and_remedy(error: Any, path: Keys, owner: type[Part]) -> tuple[str,
         case "missing":
             return "is missing", f"add {meaning or name}"
         case "literal_error":
-            words = _words(context["expected"])
+            words = _quoted_words(context["expected"])
             suggestion = rename_hint(name, error["input"]) or suggest(error["input"], words)
             usual = "none" if error["input"] in _OFF and "none" in words else words[0]
             return f"must be {context['expected']}", suggestion or f"use {usual}"
@@ -248,7 +248,7 @@ def _problem_and_remedy(error: Any, path: Keys, owner: type[Part]) -> tuple[str,
     return problem.format_map(context), meaning
 
 
-def _words(expected: str) -> Sequence[str]:
+def _quoted_words(expected: str) -> Sequence[str]:
     return re.findall(r"'([^']*)'", expected) or [expected]
 
 

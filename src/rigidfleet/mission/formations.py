@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from rigidfleet._common.text import agent_names
 from rigidfleet.formation import distance_geometry, graphs, shapes
-from rigidfleet.formation.rest import places_beside
+from rigidfleet.formation.rest import rest_places_beside
 from rigidfleet.math import proximity
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
@@ -26,7 +26,7 @@ _DARK = "#000000"
 _MOST_CLIQUES = 5e6
 
 
-def is_sound(m: FindingCollector, name: str) -> bool:
+def has_no_findings(m: FindingCollector, name: str) -> bool:
     """Whether a formation has no findings."""
     return m.is_valid(("formations",), name)
 
@@ -51,7 +51,7 @@ def most_edges(n: int) -> int:
     return max(bounds.EDGES, bounds.EDGES_EACH * n)
 
 
-def rules(m: Draft) -> Breaches:
+def formation_rules(m: Draft) -> Breaches:
     """Each formation by itself; all are parts of the mission, including those with findings."""
     m.parts["formations"] = {}
     tables = m.data.get("formations", {})
@@ -66,10 +66,10 @@ def rules(m: Draft) -> Breaches:
         path = ("formations", name)
         if (form := m.validate(Formation, data, path)) is not None:
             m.formations[name] = form
-            m.record_breaches(path, _formation(m, form, name))
+            m.record_breaches(path, _own_formation_rules(m, form, name))
 
 
-def _formation(m: Draft, form: Formation, name: str) -> Breaches:
+def _own_formation_rules(m: Draft, form: Formation, name: str) -> Breaches:
     """A formation has slots or distances for all agents, and nothing without effect."""
     path, n = ("formations", name), m.n
     if n is not None and (form.rest is not None or form.agents is not None):
@@ -84,7 +84,7 @@ def _formation(m: Draft, form: Formation, name: str) -> Breaches:
         remedy = f"give shape and size; shapes: {', '.join(shapes.SHAPES)}"
         yield Breach((), problem, remedy, None)
     if form.shape is not None:
-        yield from _shape(m, form, form.shape, n, path)
+        yield from _shape_rules(m, form, form.shape, n, path)
     if n is None:
         return
     edges = n * (n - 1) // 2 if form.edges == "complete" else len(form.edges)
@@ -108,10 +108,10 @@ def _formation(m: Draft, form: Formation, name: str) -> Breaches:
         problem = f"has {len(form.colour)} colours for {n} agents"
         yield Breach("colour", problem, "give one colour, or one per slot", None)
     if m.is_valid(path, "edges"):
-        yield from _edges(m, form, n, path)
+        yield from _edge_rules(m, form, n, path)
     if form.distances is not None and m.is_valid(path, "edges", "distances"):
-        yield from _distances(form, form.distances, n)
-    if (form.dimension or m.data.get("dimension")) == 2 and is_sound(m, name):
+        yield from _distance_rules(form, form.distances, n)
+    if (form.dimension or m.data.get("dimension")) == 2 and has_no_findings(m, name):
         slots = form.slot_array(n)
         if slots is not None and distance_geometry.dimension(slots) > 2:
             problem = "the slots do not lie in a plane, but the dimension is 2"
@@ -130,7 +130,7 @@ def _with_rest(m: Draft, form: Formation, n: int, path: Keys) -> Generator[Breac
         if form.agents > n:
             yield Breach("agents", f"is more than the {n} agents", "give fewer")
             return form
-        yield from _shape(m, form, form.shape, form.agents, path)
+        yield from _shape_rules(m, form, form.shape, form.agents, path)
         if not m.is_valid(path, "shape", "size"):
             return form
         made = form.slot_array(form.agents)
@@ -156,7 +156,7 @@ def _with_rest(m: Draft, form: Formation, n: int, path: Keys) -> Generator[Breac
         yield Breach("rest", "needs two or more slots", "give the places as a list of points")
         return form
     else:
-        places = tuple(map(tuple, places_beside(slots, waiting).tolist()))
+        places = tuple(map(tuple, rest_places_beside(slots, waiting).tolist()))
     colour = form.colour
     if colour is not None:
         lit = (colour,) * len(slots) if isinstance(colour, str) else colour
@@ -165,7 +165,7 @@ def _with_rest(m: Draft, form: Formation, n: int, path: Keys) -> Generator[Breac
     return form.model_copy(update=changed)
 
 
-def _shape(m: Draft, form: Formation, shape: str, n: int | None, path: Keys) -> Breaches:
+def _shape_rules(m: Draft, form: Formation, shape: str, n: int | None, path: Keys) -> Breaches:
     """A shape has a name, a size, and suits the number of agents."""
     if shape not in shapes.SHAPES:
         yield Breach("shape", "unknown shape", suggest_shape(shape))
@@ -185,10 +185,10 @@ def _shape(m: Draft, form: Formation, shape: str, n: int | None, path: Keys) -> 
             yield Breach("size", problem, "reduce the size")
 
 
-def _edges(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
+def _edge_rules(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
     """Edges join different agents, each pair once."""
     if isinstance(form.edges, str):
-        yield from _graph(m, form, n, path)
+        yield from _graph_rules(m, form, n, path)
         return
     seen: dict[tuple[int, ...], int] = {}
     for k, edge in enumerate(form.edges):
@@ -202,7 +202,7 @@ def _edges(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
             yield Breach(("edges", k), f"repeats edge {first + 1}", "remove it and its distance")
 
 
-def _graph(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
+def _graph_rules(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
     """A named graph can be derived from the slots; all except 'complete' are."""
     if form.edges != "neighbours" and "reach" in form.model_fields_set:
         yield Breach("reach", f"has no effect with edges '{form.edges}'", "remove it")
@@ -230,7 +230,7 @@ def _graph(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
         yield Breach("edges", str(error), "use 'neighbours' or give a list of pairs")
 
 
-def _distances(form: Formation, lengths: Sequence[float], n: int) -> Breaches:
+def _distance_rules(form: Formation, lengths: Sequence[float], n: int) -> Breaches:
     """There is a distance for each edge, and points with these distances exist."""
     edges = form.edge_array(n)
     if len(lengths) != len(edges):

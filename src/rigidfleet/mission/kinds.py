@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet.foreign.curves import rows_to_curve
-from rigidfleet.math.piecewise import Piecewise, join
+from rigidfleet.math.piecewise import Piecewise, join_curves
 from rigidfleet.mission import values
 from rigidfleet.mission.values import AUTO, Part, key, models_by_kind, required_key
 from rigidfleet.typing import Ints
@@ -558,7 +558,7 @@ class Follow(Cruising):
         ValueError
             They have too many knots in all.
         """
-        return join([rows_to_curve(rows) for rows in self.trajectories or ()], _COEFFICIENTS)
+        return join_curves([rows_to_curve(rows) for rows in self.trajectories or ()], _COEFFICIENTS)
 
     @property
     def turns_away(self) -> bool:

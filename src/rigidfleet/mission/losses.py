@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet.mission.findings import Keys, suggest
-from rigidfleet.mission.formations import is_sound
+from rigidfleet.mission.formations import has_no_findings
 from rigidfleet.mission.kinds import AnyPhase, seconds
 from rigidfleet.mission.obstacles import is_ground
 from rigidfleet.mission.rules import Breach, Breaches, Draft
@@ -29,10 +29,10 @@ _NO_GROUND = (
 )
 
 
-def rules(m: Draft) -> Breaches:
+def loss_rules(m: Draft) -> Breaches:
     """Vehicles and links that can be lost, what can follow, and a ground for landings."""
     d: Disturbances | None = m.disturbances
-    yield from _abort(m)
+    yield from _abort_rules(m)
     grounded = not m.is_valid((), "obstacles") or any(map(is_ground, m.obstacles))
     for k, p in enumerate(m.phases):
         if p.grounded and not grounded:
@@ -40,11 +40,11 @@ def rules(m: Draft) -> Breaches:
     links = m.network.lost if m.network else ()
     if d is None:
         return
-    yield from _vehicles(m, d)
+    yield from _lost_vehicle_rules(m, d)
     for k, one in enumerate(d.stuck):
         path = (_TABLE, "stuck", k)
-        yield from agents_exist(m, (*path, "agent"), (one.agent,))
-        yield from in_time(m, one.time, path)
+        yield from agent_rules(m, (*path, "agent"), (one.agent,))
+        yield from loss_time_rules(m, one.time, path)
     if d.stuck and m.network is None and m.is_valid((), "network"):
         problem = "needs vehicles that fly by themselves: without [network], one law commands all"
         yield Breach((_TABLE, "stuck"), problem, "add [network], or remove it", None)
@@ -59,20 +59,20 @@ def rules(m: Draft) -> Breaches:
     if d.hold_until is not None and d.hold_until <= first:
         problem = f"is not after the first loss at {first:g} s"
         yield Breach((_TABLE, "hold_until"), problem, "give a later time or remove it")
-    yield from _slots_tracked(m, first, "loss", "brake", "on_loss = 'continue'")
+    yield from _slot_tracking_rules(m, first, "loss", "brake", "on_loss = 'continue'")
     if d.on_loss == "land":
         if not grounded:
             yield Breach((_TABLE, "on_loss"), *_NO_GROUND)
-        yield from _landings(m, d, m.n, first)
+        yield from _landing_rules(m, d, m.n, first)
 
 
-def _abort(m: Draft) -> Breaches:
+def _abort_rules(m: Draft) -> Breaches:
     """An abort is ordered in time, while slots are tracked."""
     options: Aborting | None = m.abort
     if options is not None:
         for k, agent in enumerate(options.agents):
             again = "leaves twice" if agent in options.agents[:k] else ""
-            yield from agents_exist(m, ("abort", "agents", k), (agent,), again)
+            yield from agent_rules(m, ("abort", "agents", k), (agent,), again)
     if options is None or options.at is None or m.end is None or m.findings:
         return
     begins = options.at + options.reaction
@@ -80,12 +80,12 @@ def _abort(m: Draft) -> Breaches:
         within = f"after the start and before the end of the mission at {m.end:g} s"
         problem = f"and the reaction of {options.reaction:g} s are not {within}"
         yield Breach(("abort", "at"), problem, "give another time or remove it")
-    yield from _slots_tracked(m, begins, "abort", "slow down", "abort at another time")
+    yield from _slot_tracking_rules(m, begins, "abort", "slow down", "abort at another time")
 
 
-def _slots_tracked(m: Draft, when: float, what: str, does: str, other: str) -> Breaches:
+def _slot_tracking_rules(m: Draft, when: float, what: str, does: str, other: str) -> Breaches:
     """Slots are tracked in what may be under way at a loss or abort at a time [s]; words of it, and another remedy."""
-    for k, p in under_way(m.phases, when):
+    for k, p in phases_under_way(m.phases, when):
         if p.control != "tracking":
             problem = (
                 f"may be under way at the {what} at {when:g} s, but only tracked slots can {does}"
@@ -94,14 +94,14 @@ def _slots_tracked(m: Draft, when: float, what: str, does: str, other: str) -> B
             yield Breach(("phases", k, "control"), problem, remedy, p.control)
 
 
-def _vehicles(m: Draft, d: Disturbances) -> Breaches:
+def _lost_vehicle_rules(m: Draft, d: Disturbances) -> Breaches:
     """Vehicles exist, are lost once and in time, and some are left, in equations that can do without them."""
     lost = [one.agent for one in d.lost]
     for k, one in enumerate(d.lost):
         path = (_TABLE, "lost", k)
         again = "is lost twice" if one.agent in lost[:k] else ""
-        yield from agents_exist(m, (*path, "agent"), (one.agent,), again)
-        yield from in_time(m, one.time, path)
+        yield from agent_rules(m, (*path, "agent"), (one.agent,), again)
+        yield from loss_time_rules(m, one.time, path)
     if m.n is not None and len(set(lost)) >= m.n:
         yield Breach((_TABLE, "lost"), "all vehicles are lost", "keep at least one")
     for key, possible, whose in (
@@ -115,7 +115,7 @@ def _vehicles(m: Draft, d: Disturbances) -> Breaches:
             yield Breach((_TABLE, "lost"), problem, f"use {key} = '{possible}'")
 
 
-def agents_exist(m: Draft, where: Keys, agents: Sequence[int], again: str = "") -> Breaches:
+def agent_rules(m: Draft, where: Keys, agents: Sequence[int], again: str = "") -> Breaches:
     """Agents exist, and are not lost ``again``, in words."""
     if m.n is not None and not all(1 <= agent <= m.n for agent in agents):
         yield Breach(where, "there is no such agent", f"agents are numbered from 1 to {m.n}")
@@ -123,14 +123,14 @@ def agents_exist(m: Draft, where: Keys, agents: Sequence[int], again: str = "") 
         yield Breach(where, again, "remove one of the two")
 
 
-def in_time(m: Draft, time: float, path: Keys) -> Breaches:
+def loss_time_rules(m: Draft, time: float, path: Keys) -> Breaches:
     """A loss is before the end of the mission."""
     if m.end is not None and time >= m.end:
         problem = f"is not before the end of the mission at {m.end:g} s"
         yield Breach((*path, "time"), problem, "give an earlier time or remove the entry")
 
 
-def under_way(phases: Sequence[AnyPhase], t: float) -> Iterator[tuple[int, AnyPhase]]:
+def phases_under_way(phases: Sequence[AnyPhase], t: float) -> Iterator[tuple[int, AnyPhase]]:
     """Phases that may be under way at a time [s]: one that settles may do so early or late."""
     first = last = 0.0
     for k, p in enumerate(phases):
@@ -147,7 +147,7 @@ def under_way(phases: Sequence[AnyPhase], t: float) -> Iterator[tuple[int, AnyPh
             yield k, p
 
 
-def _landings(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
+def _landing_rules(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
     """Vehicles of a formation that lands reach the ground together."""
     forms, radius, name = m.formations, m.agents.radius, d.landing_formation
     if name is not None:
@@ -156,28 +156,28 @@ def _landings(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
             remedy = suggest(name, forms) or f"formations: {', '.join(forms)}"
             yield Breach(where, "there is no such formation", remedy)
             return
-        slots = forms[name].slot_array(n) if is_sound(m, name) else None
-        words = "it has no slots to track" if slots is None else _uneven(slots, radius)
+        slots = forms[name].slot_array(n) if has_no_findings(m, name) else None
+        words = "it has no slots to track" if slots is None else _uneven_text(slots, radius)
         if words:
             remedy = "name a level formation, such as a line or a square"
             yield Breach(where, f"cannot land: {words}", remedy)
         return
     held: dict[str | None, None] = {}
-    for k, _ in under_way(m.phases, first):
+    for k, _ in phases_under_way(m.phases, first):
         taken = [p.shaping.formation for p in m.phases[: k + 1] if p.shaping is not None]
         held[taken[-1] if taken else None] = None
     for one in held:
         points = np.array(m.agents.position) if one is None else forms[one].slot_array(n)
         if points is None:
             continue  # distances alone cannot be tracked, which is another finding
-        if words := _uneven(points, radius):
+        if words := _uneven_text(points, radius):
             what = "the start" if one is None else f"'{one}'"
             problem = f"{what} cannot land as it is: {words}"
             remedy = "give landing_formation, a level formation that is taken before the descent"
             yield Breach((_TABLE, "on_loss"), problem, remedy)
 
 
-def _uneven(points: Floats, radius: Sequence[float]) -> str:
+def _uneven_text(points: Floats, radius: Sequence[float]) -> str:
     """Why vehicles at these places (N, 3) do not reach the ground together; "" if they do."""
     points, size = np.asarray(points), np.array(radius)
     bottom = points[:, 2] - size

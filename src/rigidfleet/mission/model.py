@@ -23,17 +23,17 @@ from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.math.lqr import double_integrator_gains
 from rigidfleet.math.rigid_body import about_cm
-from rigidfleet.mission.changes import with_own_names, with_scales
-from rigidfleet.mission.check import checked_parts, defaults
+from rigidfleet.mission.changes import add_scaled_formations, split_shared_formations
+from rigidfleet.mission.check import check_parts, default_tables
 from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
 from rigidfleet.mission.phases import end_of_phases
 from rigidfleet.mission.schema import DRAG, Aborting, Contents
 from rigidfleet.mission.text import parse_toml, read_error
-from rigidfleet.mission.vehicles import VehicleModel, resolve
+from rigidfleet.mission.vehicles import VehicleModel, model_of_vehicle
 from rigidfleet.solids.distance import height_below
-from rigidfleet.solids.records import Solids, join
+from rigidfleet.solids.records import Solids, join_solids
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Smallest and largest damping that "auto" uses. Below, rounding errors show; docs/robustness.md has the measurements.
@@ -135,14 +135,14 @@ class Mission(Contents, Shown):
         MissionError
             With a finding for each error.
         """
-        parts = checked_parts(data, origin)
+        parts = check_parts(data, origin)
         if parts["assignment"] == "each":
-            parts["formations"], parts["phases"] = with_own_names(
+            parts["formations"], parts["phases"] = split_shared_formations(
                 parts["formations"], parts["phases"]
             )
         n = len(parts["agents"].position)
-        parts["formations"] = with_scales(parts["formations"], parts["phases"], n)
-        mission = cls.model_construct(set(parts), **defaults() | parts)
+        parts["formations"] = add_scaled_formations(parts["formations"], parts["phases"], n)
+        mission = cls.model_construct(set(parts), **default_tables() | parts)
         mission._data, mission._text, mission._origin = data, text, origin
         return mission
 
@@ -329,7 +329,7 @@ class Mission(Contents, Shown):
                 commanded = self.establish_attitude(establishing, commanded)
                 axes = None if lies is None else lies @ commanded.T
                 lies = commanded
-            slots = self._slots(name)
+            slots = self._slots_in_own_order(name)
             if slots is None:
                 known = False
             elif name not in flown:
@@ -388,7 +388,7 @@ class Mission(Contents, Shown):
         return {}
 
     @_compute_once
-    def _slots(self, name: str) -> Floats | None:
+    def _slots_in_own_order(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation in their own order."""
         return self.formations[name].slot_array(self.n_agents)
 
@@ -406,7 +406,7 @@ class Mission(Contents, Shown):
 
         Without slots, they are derived from the distances; None if the distances are not complete.
         """
-        slots = self._slots(name)
+        slots = self._slots_in_own_order(name)
         return None if slots is None else slots[self.assigned_slots[name]]
 
     @_compute_once
@@ -454,7 +454,7 @@ class Mission(Contents, Shown):
             slots, masses = slots[left], masses[left]
         if not len(edges) or min(len(edges), 3 * len(masses)) > _DENSE:
             return _DAMPING[1]
-        return _damping(slots.tobytes(), edges.tobytes(), masses.tobytes())
+        return _automatic_damping(slots.tobytes(), edges.tobytes(), masses.tobytes())
 
     @property
     def latest_end(self) -> float:
@@ -487,7 +487,7 @@ class Mission(Contents, Shown):
     @cached_property
     def roofs(self) -> Solids:
         """What counts as ground besides it: height maps, and boxes at rest that are no zones."""
-        return join([o.solid for o in self.solids if is_ground(o)])
+        return join_solids([o.solid for o in self.solids if is_ground(o)])
 
     def height_at(self, x: ArrayLike, y: ArrayLike, z: ArrayLike = np.inf) -> Floats:
         """Height [m] of what is below points (x, y) [m], arrays of one shape or numbers; minus infinity: nothing.
@@ -526,7 +526,7 @@ class Mission(Contents, Shown):
         """The vehicle of each agent; None if all are point masses that give any force at once."""
         if not self.agents.vehicle:
             return None
-        models = {name: resolve(vehicle) for name, vehicle in self.vehicles.items()}
+        models = {name: model_of_vehicle(vehicle) for name, vehicle in self.vehicles.items()}
         return [models[name] for name in self.agents.vehicle]
 
     @cached_property
@@ -621,7 +621,7 @@ class Mission(Contents, Shown):
 
 
 @lru_cache(64)
-def _damping(slots: bytes, edges: bytes, masses: bytes) -> float:
+def _automatic_damping(slots: bytes, edges: bytes, masses: bytes) -> float:
     """Damping "auto" of a formation held: slots (N, 3) [m], edges (m, 2) and masses (N,) [kg].
 
     All runs of a sweep ask for the same: it would be a tenth of a short flight.
@@ -629,6 +629,6 @@ def _damping(slots: bytes, edges: bytes, masses: bytes) -> float:
     r, pairs = np.frombuffer(slots).reshape(1, -1, 3), np.frombuffer(edges, np.int64).reshape(-1, 2)
     J = constraint_jacobian.jacobian(r, pairs)
     least, most = _DAMPING
-    (singular,) = constraint_jacobian.smallest_value(J, np.frombuffer(masses))  # of mbar J M^-1 J^T
+    (singular,) = constraint_jacobian.least_singular(J, np.frombuffer(masses))  # of mbar J M^-1 J^T
     w = float(singular) ** 2
     return min(max(w / 4, least), most)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from rigidfleet.mission.losses import agents_exist, in_time
+from rigidfleet.mission.losses import agent_rules, loss_time_rules
 from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.schema import Network
 from rigidfleet.mission.vehicles import NOT_SAMPLED
 
 
-def rules(m: Draft) -> Breaches:
+def network_rules(m: Draft) -> Breaches:
     """Vehicles with sampled control hear each other, and what they compute is by neighbours."""
     net: Network | None = m.network
     if net is None:
@@ -23,7 +23,7 @@ def rules(m: Draft) -> Breaches:
     for key in ("late", "drift") if net.clocks else ():
         yield from m.one_per_agent(net.clocks, key, "clocks", alone=", or a single number")
     for k, one in enumerate(net.outages):
-        yield from agents_exist(m, ("outages", k, "between"), one.between)
+        yield from agent_rules(m, ("outages", k, "between"), one.between)
         if one.end <= one.start:
             yield Breach(("outages", k, "end"), "is not after start", "give a later end")
     pairs = [tuple(sorted(one.between)) for one in net.lost]
@@ -32,8 +32,8 @@ def rules(m: Draft) -> Breaches:
         again = "is lost twice" if pair in pairs[:k] else ""
         if pair[0] == pair[1]:
             again = "joins an agent to itself"
-        yield from agents_exist(m, (*path, "between"), pair, again)
-        yield from in_time(m, net.lost[k].time, path)
+        yield from agent_rules(m, (*path, "between"), pair, again)
+        yield from loss_time_rules(m, net.lost[k].time, path)
     solver, kinds = m.constraint.solver, ("iterated", "exact")
     if solver not in kinds:
         problem = "is not by neighbours: it needs the eigenvalues of all edges together"

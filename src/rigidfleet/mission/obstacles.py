@@ -46,7 +46,7 @@ class Solid(Part):
         return (), ()
 
     @property
-    def there(self) -> tuple[float, float]:
+    def lifetime(self) -> tuple[float, float]:
         """Times from which and until which the obstacle is there [s]."""
         return records.ALWAYS
 
@@ -60,7 +60,7 @@ class Solid(Part):
             The points of a hull lie in a plane.
         """
         ways, times = self.motion
-        return records.one_solid(self.form, times, ways, self.there)
+        return records.one_solid(self.form, times, ways, self.lifetime)
 
 
 class Moving(Solid):
@@ -85,12 +85,12 @@ class Moving(Solid):
         if self.velocity is not None and any(self.velocity):
             return np.outer([0.0, _EVER], self.velocity), np.array([0.0, _EVER])
         if self.waypoints is None:
-            still = np.isfinite(self.there).any()  # one that appears counts as one that moves
+            still = np.isfinite(self.lifetime).any()  # one that appears counts as one that moves
             return (np.zeros((1, 3)), np.zeros(1)) if still else ((), ())
         return np.array(self.waypoints) - self.centre_of_form, np.array(self.times)
 
     @property
-    def there(self) -> tuple[float, float]:
+    def lifetime(self) -> tuple[float, float]:
         """Times from which and until which the obstacle is there [s]."""
         since, until = records.ALWAYS
         return (
@@ -244,12 +244,12 @@ def is_ground(thing: Obstacle) -> bool:
     return firm or isinstance(thing, Ground)
 
 
-def rules(m: FindingCollector, thing: Any, path: Keys) -> Breaches:
+def obstacle_rules(m: FindingCollector, thing: Any, path: Keys) -> Breaches:
     """What an obstacle at a path needs besides its keys."""
     if isinstance(thing, Heights):
-        yield from _heights(m, thing, path)
+        yield from _height_map_rules(m, thing, path)
     elif isinstance(thing, Moving):
-        yield from _motion(m, thing, path)
+        yield from _motion_rules(m, thing, path)
     if isinstance(thing, Cylinder) and math.dist(*thing.ends) < bounds.LENGTH.least:
         yield Breach("ends", "has both ends at the same place", "give the centres of its two ends")
     if isinstance(thing, Hull) and m.is_valid(path, "points", "waypoints", "times"):
@@ -260,11 +260,11 @@ def rules(m: FindingCollector, thing: Any, path: Keys) -> Breaches:
             yield Breach("points", str(error), remedy, None)
 
 
-def _motion(m: FindingCollector, thing: Moving, path: Keys) -> Breaches:
+def _motion_rules(m: FindingCollector, thing: Moving, path: Keys) -> Breaches:
     """An obstacle appears before it vanishes, and has a time for each waypoint."""
     ways, times = thing.waypoints, thing.times
-    if not thing.there[0] < thing.there[1]:
-        problem = f"is not after {thing.there[0]:g} s, when the obstacle appears"
+    if not thing.lifetime[0] < thing.lifetime[1]:
+        problem = f"is not after {thing.lifetime[0]:g} s, when the obstacle appears"
         yield Breach("vanishes", problem, "let it vanish after it has appeared")
     elif thing.velocity is not None and ways is not None:
         yield Breach("velocity", "has no effect with waypoints", "remove one of them")
@@ -279,7 +279,7 @@ def _motion(m: FindingCollector, thing: Moving, path: Keys) -> Breaches:
         yield Breach("times", "must increase", "order the waypoints by time")
 
 
-def _heights(m: FindingCollector, thing: Heights, path: Keys) -> Breaches:
+def _height_map_rules(m: FindingCollector, thing: Heights, path: Keys) -> Breaches:
     """A height map has heights, on a grid, above its base."""
     if thing.file is not None:
         yield Breach("file", NOT_A_FILE, "load the mission from its file, or give heights")

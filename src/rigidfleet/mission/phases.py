@@ -16,7 +16,7 @@ from rigidfleet.formation import distance_geometry
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys, suggest
-from rigidfleet.mission.formations import is_sound
+from rigidfleet.mission.formations import has_no_findings
 from rigidfleet.mission.kinds import (
     ANGLES,
     KINDS,
@@ -48,33 +48,37 @@ Written = Sequence[Any]
 Lengths = list[float | None]
 
 
-def rules(m: Draft) -> Breaches:
+def phase_rules(m: Draft) -> Breaches:
     """All phases, by themselves and together; they are parts of the mission, including those with findings."""
-    phases = yield from _phases(m)
+    phases = yield from _validate_phases(m)
     m.parts["phases"] = tuple(p for p in phases if p is not None)
-    _check(m, phases)
+    _check_phases(m, phases)
     end = end_of_phases(m.phases) if m.is_valid((), "phases") else math.nan
     # With automatic durations it is not known; the mission is checked again when they are.
     m.end = None if math.isnan(end) else end
 
 
-def _check(m: Draft, phases: Written) -> None:
+def _check_phases(m: Draft, phases: Written) -> None:
     """Check phases together, then each with what it needs."""
     lengths: Lengths = [None] * len(phases)
-    m.record_breaches(("phases",), _names(phases))
-    m.record_breaches((), _times(m, phases, lengths))
+    m.record_breaches(("phases",), _phase_name_rules(phases))
+    m.record_breaches((), _phase_time_rules(m, phases, lengths))
     for k, p in enumerate(phases):
         if p is not None:
             path = ("phases", k)
-            m.record_breaches(path, _motion(m, p, k, lengths[k]))
+            m.record_breaches(path, _motion_time_rules(m, p, k, lengths[k]))
             if m.is_valid(path, "control"):
-                m.record_breaches(path, _control(m, p))
+                m.record_breaches(path, _control_rules(m, p))
                 if own := _OWN.get(p.kind):
                     m.record_breaches(path, own(m, p, k, lengths[k]))
-    m.record_breaches((), _formations(m, phases))
+    m.record_breaches((), _formation_use_rules(m, phases))
     for k, p in enumerate(phases):
         if p is not None:
-            for rules in _arrival(m, p), _smoothness(m, p, k), _automatic(m, p, k):
+            for rules in (
+                _arrival_rules(m, p),
+                _smoothness_rules(m, p, k),
+                _automatic_time_rules(m, p, k),
+            ):
                 m.record_breaches(("phases", k), rules)
 
 
@@ -90,7 +94,7 @@ def end_of_phases(phases: Sequence[AnyPhase]) -> float:
     return t
 
 
-def _phases(m: Draft) -> Generator[Breach, None, list[Any]]:
+def _validate_phases(m: Draft) -> Generator[Breach, None, list[Any]]:
     """Each phase with defaults for name and control; None for a phase that is not valid."""
     body = m.data.get("architecture") == "body"
     phases: list[Any] = []
@@ -107,7 +111,7 @@ def _phases(m: Draft) -> Generator[Breach, None, list[Any]]:
     return phases
 
 
-def _names(phases: Written) -> Breaches:
+def _phase_name_rules(phases: Written) -> Breaches:
     """Names are unique."""
     seen: dict[str, int] = {}
     for k, p in enumerate(phases):
@@ -117,7 +121,7 @@ def _names(phases: Written) -> Breaches:
             yield Breach((k, "name"), problem, "give each phase its own name", p.name)
 
 
-def _times(m: Draft, phases: Written, lengths: Lengths) -> Breaches:
+def _phase_time_rules(m: Draft, phases: Written, lengths: Lengths) -> Breaches:
     """Each phase has one ending, and ends increase; notes the greatest ``lengths`` of phases."""
     first: float | None = 0.0  # earliest and latest start of the phase; None if unknown
     last: float | None = 0.0
@@ -158,10 +162,10 @@ def _times(m: Draft, phases: Written, lengths: Lengths) -> Breaches:
             first = first + (shortest or 0.0) if first is not None else None
             last = last + (longest or 0.0) if last is not None else None
         lengths[k] = longest
-    yield from _samples(m, last)
+    yield from _sample_rules(m, last)
 
 
-def _motion(m: Draft, p: Phase, k: int, longest: float | None) -> Breaches:
+def _motion_time_rules(m: Draft, p: Phase, k: int, longest: float | None) -> Breaches:
     """The travel or blend of a phase is not longer than the phase."""
     lasts = p.least_time
     if not m.is_valid(("phases", k), "reference", *_ENDINGS):
@@ -180,7 +184,7 @@ def _motion(m: Draft, p: Phase, k: int, longest: float | None) -> Breaches:
         yield Breach("travel", problem, "reduce travel or end the phase later", lasts)
 
 
-def _samples(m: Draft, end: float | None) -> Breaches:
+def _sample_rules(m: Draft, end: float | None) -> Breaches:
     """A result has samples, and not too many."""
     step, n = m.output_step, m.n or 0
     if not end or not m.is_valid((), "output_step", "formations"):
@@ -211,7 +215,7 @@ def _samples(m: Draft, end: float | None) -> Breaches:
     yield Breach("output_step", problem, remedy, step)
 
 
-def _control(m: Draft, p: Phase) -> Breaches:
+def _control_rules(m: Draft, p: Phase) -> Breaches:
     """The mission has the control of a phase, and the phase what that control needs."""
     if p.control == "body" and m.data.get("architecture", "local") == "local":
         remedy = "use control = 'tracking', or architecture = 'body' for the mission"
@@ -231,14 +235,14 @@ def _control(m: Draft, p: Phase) -> Breaches:
 # Arguments: the mission, the phase, its number from 0, its greatest duration [s] or None.
 
 
-def _turn(m: Draft, p: Turn, k: int, _: float | None) -> Breaches:
+def _turn_rules(m: Draft, p: Turn, k: int, _: float | None) -> Breaches:
     """A turn has a target angle."""
     if p.attitude_deg is None and m.is_valid(("phases", k), *ANGLES):
         remedy = f"give at least one of {', '.join(reversed(ANGLES))}"
         yield Breach((), "has no target angle", remedy, p.name)
 
 
-def _establish(m: Draft, p: Establish, k: int, _: float | None) -> Breaches:
+def _establish_rules(m: Draft, p: Establish, k: int, _: float | None) -> Breaches:
     """A commanded attitude has an effect."""
     if not m.is_valid(("phases", k), "attitude", *ANGLES):
         return
@@ -254,7 +258,7 @@ def _establish(m: Draft, p: Establish, k: int, _: float | None) -> Breaches:
         yield Breach([*angles, "attitude"][0], problem, remedy)
 
 
-def _orbit(m: Draft, p: Orbit, k: int, longest: float | None) -> Breaches:
+def _orbit_rules(m: Draft, p: Orbit, k: int, longest: float | None) -> Breaches:
     """An orbit has tracked slots, a rate within bounds, and an end."""
     if p.control == "body":
         problem = "an orbit cannot be flown by a wrench on the virtual body"
@@ -275,7 +279,7 @@ def _orbit(m: Draft, p: Orbit, k: int, longest: float | None) -> Breaches:
         yield Breach("rate_deg_s", problem, "use a lower rate or several phases")
 
 
-def _tracked_way(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
+def _tracked_way_rules(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
     """A phase with a way of its own has tracked slots and a time of arrival."""
     if p.control == "body":
         problem = f"kind '{p.kind}' cannot be flown by a wrench on the virtual body"
@@ -285,9 +289,9 @@ def _tracked_way(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
         yield Breach("settle", problem, "end it by duration or until", None)
 
 
-def _vertical(m: Draft, p: Any, k: int, longest: float | None) -> Breaches:
+def _vertical_rules(m: Draft, p: Any, k: int, longest: float | None) -> Breaches:
     """A take-off or a landing has what its groups need, and agents that exist."""
-    yield from _tracked_way(m, p, k, longest)
+    yield from _tracked_way_rules(m, p, k, longest)
     if p.lands and p.places == "own" and (p.agents or p.stagger or p.travel or p.until):
         problem = "leads all vehicles together, without agents, stagger, travel and until"
         yield Breach("places", problem, "remove these, and end the phase by its duration")
@@ -301,23 +305,23 @@ def _vertical(m: Draft, p: Any, k: int, longest: float | None) -> Breaches:
         where = "until" if p.until is not None else "duration"
         problem = "does not say how long a staggered phase lasts"
         yield Breach(where, problem, "give its duration in seconds")
-    yield from agents_exist_once(m, p.agents, "agents")
+    yield from named_agent_rules(m, p.agents, "agents")
 
 
-def _go(m: Draft, p: Go, k: int, longest: float | None) -> Breaches:
+def _go_rules(m: Draft, p: Go, k: int, longest: float | None) -> Breaches:
     """A way can be found and flown: tracked slots, an end, and formations that exist."""
-    yield from _tracked_way(m, p, k, longest)
+    yield from _tracked_way_rules(m, p, k, longest)
     for name in p.formations or ():
-        yield from _formation_exists(m, name, "formations")
+        yield from _formation_existence_rules(m, name, "formations")
 
 
 #: Greatest jumps of position [m] and velocity [m/s] within a trajectory: those of numbers rounded in a file.
 _JUMPS = ((0.01, "m"), (0.1, "m/s"))
 
 
-def _follow(m: Draft, p: Follow, k: int, longest: float | None) -> Breaches:
+def _follow_rules(m: Draft, p: Follow, k: int, longest: float | None) -> Breaches:
     """There are trajectories, without jumps, one for the virtual body or one for each vehicle, and an end."""
-    yield from _tracked_way(m, p, k, longest)
+    yield from _tracked_way_rules(m, p, k, longest)
     if p.trajectories is None:
         problem, remedy = "is missing", "give the name of a file with trajectories"
         if p.file is not None:
@@ -361,7 +365,7 @@ def _follow(m: Draft, p: Follow, k: int, longest: float | None) -> Breaches:
         yield Breach("trajectories", str(error), remedy, None)
 
 
-def _reshape(m: Draft, p: Reshape, k: int, _: float | None) -> Breaches:
+def _reshape_rules(m: Draft, p: Reshape, k: int, _: float | None) -> Breaches:
     """Ways other than straight ones can be found and flown, or are given, and nothing else bends them."""
     rows, n = p.control_points, m.n
     if rows is not None and n is not None:
@@ -388,19 +392,19 @@ def _reshape(m: Draft, p: Reshape, k: int, _: float | None) -> Breaches:
 
 
 _OWN: dict[str, Callable[[Draft, Any, int, float | None], Breaches]] = {
-    "brake": _tracked_way,
-    "establish": _establish,
-    "follow": _follow,
-    "land": _vertical,
-    "go": _go,
-    "orbit": _orbit,
-    "reshape": _reshape,
-    "takeoff": _vertical,
-    "turn": _turn,
+    "brake": _tracked_way_rules,
+    "establish": _establish_rules,
+    "follow": _follow_rules,
+    "land": _vertical_rules,
+    "go": _go_rules,
+    "orbit": _orbit_rules,
+    "reshape": _reshape_rules,
+    "takeoff": _vertical_rules,
+    "turn": _turn_rules,
 }
 
 
-def agents_exist_once(m: Draft, agents: Sequence[int], *where: str) -> Breaches:
+def named_agent_rules(m: Draft, agents: Sequence[int], *where: str) -> Breaches:
     """Agents, such as those that take off or land, exist, and are named once."""
     beyond = [i for i in agents if m.n is not None and i > m.n]
     if beyond:
@@ -412,7 +416,7 @@ def agents_exist_once(m: Draft, agents: Sequence[int], *where: str) -> Breaches:
 # -- rules of formations, smoothness and times -------------------------------------------------------
 
 
-def _formations(m: Draft, phases: Written) -> Breaches:
+def _formation_use_rules(m: Draft, phases: Written) -> Breaches:
     """Formations exist and can be blended to, tracked and reached."""
     forms: Mapping[str, Formation] = m.formations
     held: str | None = ""  # name of the formation held; "": initial positions; None: unknown
@@ -423,7 +427,7 @@ def _formations(m: Draft, phases: Written) -> Breaches:
             held = None if p is None or p.shaping is not None else held
             continue
         if (shaping := p.shaping) is not None:
-            yield from _formation_exists(m, shaping.formation, *path, "formation")
+            yield from _formation_existence_rules(m, shaping.formation, *path, "formation")
             form = forms.get(shaping.formation)
             if p.establishing is None and held == "":
                 problem = "no formation has been established yet"
@@ -434,12 +438,12 @@ def _formations(m: Draft, phases: Written) -> Breaches:
                 problem = f"formation '{shaping.formation}' is given by distances alone, which have no axes"
                 remedy = "remove it, give the formation slots, or command an attitude by yaw_deg"
                 yield Breach((*path, "attitude"), problem, remedy)
-            if m.n is not None and form is not None and is_sound(m, shaping.formation):
-                yield from _blendable(shaping, form, m.n, path)
+            if m.n is not None and form is not None and has_no_findings(m, shaping.formation):
+                yield from _blend_rules(shaping, form, m.n, path)
             held = shaping.formation
         form = forms.get(held) if held else None
         tracked = p.control == "tracking" and m.is_valid(path, "control")
-        if not tracked or m.n is None or form is None or not held or not is_sound(m, held):
+        if not tracked or m.n is None or form is None or not held or not has_no_findings(m, held):
             continue
         if held in slotted:
             continue
@@ -451,7 +455,7 @@ def _formations(m: Draft, phases: Written) -> Breaches:
             slotted.add(held)
 
 
-def _formation_exists(m: Draft, name: str, *where: str | int) -> Breaches:
+def _formation_existence_rules(m: Draft, name: str, *where: str | int) -> Breaches:
     """A formation exists."""
     known = m.data.get("formations", {})
     if isinstance(known, dict) and name not in known:
@@ -459,7 +463,7 @@ def _formation_exists(m: Draft, name: str, *where: str | int) -> Breaches:
         yield Breach(where, "there is no such formation", suggest(name, known) or names, name)
 
 
-def _blendable(p: Shaping, form: Formation, n: int, path: Keys) -> Breaches:
+def _blend_rules(p: Shaping, form: Formation, n: int, path: Keys) -> Breaches:
     """A formation can be reached by blending slots: it has slots, and distances that agree with them."""
     if p.reference != "shape":
         return
@@ -477,12 +481,12 @@ def _blendable(p: Shaping, form: Formation, n: int, path: Keys) -> Breaches:
             yield Breach(("formations", p.formation, "distances", int(i)), problem, remedy)
 
 
-def _smoothness(m: Draft, p: Phase, k: int) -> Breaches:
+def _smoothness_rules(m: Draft, p: Phase, k: int) -> Breaches:
     """A smooth mission can be smooth, and others use nothing that only smooth ones have."""
     if not m.is_valid((), "smoothness"):
         return
     through = getattr(p, "through", ())
-    if not m.smooth:
+    if not m.is_smooth:
         for key in [*p.automatic, *(["through"] if through else [])]:
             problem = "needs a smooth mission" + (" to have a least time" if key in TIMES else "")
             yield Breach(key, problem, "add smoothness = 'jerk' at the top of the mission")
@@ -512,10 +516,10 @@ def _smoothness(m: Draft, p: Phase, k: int) -> Breaches:
         yield Breach("through", problem, "pass it earlier or arrive later", None)
 
 
-def _automatic(m: Draft, p: Phase, k: int) -> Breaches:
+def _automatic_time_rules(m: Draft, p: Phase, k: int) -> Breaches:
     """Times that follow from the limits have limits to follow from."""
     keys = [key for key in p.automatic if m.is_valid(("phases", k), key)]
-    if not keys or not m.smooth:
+    if not keys or not m.is_smooth:
         return
     if p.control != "tracking":
         problem = f"needs tracked slots to have a least time, not control '{p.control}'"
@@ -536,12 +540,12 @@ def _automatic(m: Draft, p: Phase, k: int) -> Breaches:
         yield Breach(keys[0], problem, remedy)
 
 
-def _arrival(m: Draft, p: Phase) -> Breaches:
+def _arrival_rules(m: Draft, p: Phase) -> Breaches:
     """A leg with a finite horizon has a time of arrival."""
     steering = p.steering
     if steering is None or steering.settle is None or steering.travel is not None:
         return
-    if m.smooth and p.control == "tracking":
+    if m.is_smooth and p.control == "tracking":
         remedy = "give travel, or end by until or duration"
         yield Breach("settle", "a smooth way needs a time of arrival", remedy, None)
     elif m.is_valid((), "lqr"):

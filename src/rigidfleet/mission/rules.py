@@ -34,7 +34,7 @@ class Breach(NamedTuple):
 Breaches = Iterator[Breach]
 
 
-def idle_key(part: Any, key: str, other: str, *acts: str) -> Breaches:
+def idle_key_rules(part: Any, key: str, other: str, *acts: str) -> Breaches:
     """A key that is written has no effect but with one of some values of another key."""
     if key in part.model_fields_set and getattr(part, other) not in acts:
         problem = f"has no effect with {other} '{getattr(part, other)}'"
@@ -70,7 +70,7 @@ class Draft(FindingCollector):
         return isinstance(agents, dict) and "vehicle" in agents
 
     @property
-    def smooth(self) -> bool:
+    def is_smooth(self) -> bool:
         """Whether acceleration and jerk of the references are to be continuous."""
         return self.smoothness == "jerk"
 

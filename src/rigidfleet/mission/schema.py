@@ -231,7 +231,7 @@ class Agents(Part):
 
     @model_validator(mode="before")
     @classmethod
-    def _spread(cls, data: Any) -> Any:
+    def _repeat_for_agents(cls, data: Any) -> Any:
         """Repeat a single number for all agents, and let agents without velocities start at rest."""
         if not (isinstance(data, dict) and isinstance(data.get("position"), list | tuple)):
             return data
@@ -248,7 +248,7 @@ class Constraint(Part):
 
     alpha: values.Gain = key("alpha [1/s], > 0; the feedback gain of dc/dt is 2 alpha", 3.0)
     beta: values.Gain = key("beta [1/s], > 0; the feedback gain of c is beta^2", math.sqrt(12))
-    gamma: Annotated[float, Strict(), values.of_either_sign(GAIN, 3)] = key(
+    gamma: Annotated[float, Strict(), values.signed_number(GAIN, 3)] = key(
         "feedback gain of the integral of c [1/s^3], >= 0, < 2 alpha beta^2", 8.0
     )
     stabilisation: Literal["pid", "none"] = key(
@@ -273,7 +273,7 @@ class Constraint(Part):
         "fade out smoothly",
         1e-3,
     )
-    deformation_damping: Annotated[float, Strict(), values.from_zero(GAIN)] = key(
+    deformation_damping: Annotated[float, Strict(), values.number_from_zero(GAIN)] = key(
         "damping of deformation velocities while no slots are tracked [1/s], >= 0", 1.0
     )
 
@@ -309,7 +309,7 @@ class Lqr(Regulator):
 
     @model_validator(mode="before")
     @classmethod
-    def _inherit(cls, data: Any) -> Any:
+    def _inherit_weights(cls, data: Any) -> Any:
         if not (isinstance(data, dict) and isinstance(data.get("attitude", {}), dict)):
             return data
         own = {key: value for key, value in data.items() if key in Regulator.model_fields}
@@ -321,7 +321,7 @@ class Tracking(Part):
 
     Q: values.Weights = key("weights [position error, velocity error], the first > 0", (4.0, 4.0))
     R: values.Cost = key("weight of the acceleration, > 0", 1.0)
-    integral: Annotated[float, Strict(), values.from_zero(GAIN)] = key(
+    integral: Annotated[float, Strict(), values.number_from_zero(GAIN)] = key(
         "gain of the integral of the position error [1/s^3], >= 0; frozen while a vehicle saturates; only "
         "with [vehicles]",
         0.0,
@@ -768,7 +768,7 @@ class MissionHeader(Part):
         "more of a distance above each other than beside",
         1.0,
     )
-    gravity: Annotated[float, Strict(), values.from_zero(ACCELERATION)] = key(
+    gravity: Annotated[float, Strict(), values.number_from_zero(ACCELERATION)] = key(
         "gravity [m/s^2], >= 0", 9.81
     )
     output_step: values.Time = key("time between samples of the result [s]", 0.05)

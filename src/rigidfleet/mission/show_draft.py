@@ -14,7 +14,7 @@ from rigidfleet._common.toml import toml_key
 from rigidfleet.formation import shapes
 from rigidfleet.formation.assignment import assign_slots
 from rigidfleet.formation.point_files import Points
-from rigidfleet.formation.rest import places_beside
+from rigidfleet.formation.rest import rest_places_beside
 from rigidfleet.math import proximity
 from rigidfleet.mission.draft import (
     LIFT,
@@ -90,17 +90,17 @@ def points_scene(name: str, points: Points, source: str, *, by_name: bool = Fals
     return ShowFormation(name, slots, f"{about}slots = [\n{rows}]\n{lights}")
 
 
-def _with_rest(one: ShowFormation, agents: int) -> ShowFormation:
+def _add_resting_vehicles(one: ShowFormation, agents: int) -> ShowFormation:
     """A scene in which the vehicles that have no point rest at its sides."""
     waiting = agents - len(one.slots)
     if waiting < 1:
         return one
-    slots = np.concatenate([one.slots, places_beside(one.slots, waiting)])
+    slots = np.concatenate([one.slots, rest_places_beside(one.slots, waiting)])
     line = f'rest = "sides"                  # {waiting} vehicles wait, dark\n'
     return ShowFormation(one.name, slots, one.table + line)
 
 
-def show_text(
+def show_mission_text(
     name: str, scenes: Sequence[ShowFormation], *, agents: int, spacing: float, mass: float = _MASS,
     thrust_limit: float | None = None, file: str = "",
 ) -> str:  # fmt: skip
@@ -125,7 +125,7 @@ def show_text(
         raise ValueError("a show needs formations")
     ground = "grid" if agents in shapes.SHAPES["grid"].agents else "line"
     pads = shape_scene(ground, agents, spacing)._replace(name="pads")
-    tables, scenes = {"pads": pads}, [_with_rest(one, agents) for one in scenes]
+    tables, scenes = {"pads": pads}, [_add_resting_vehicles(one, agents) for one in scenes]
     for i, one in enumerate(scenes):
         key, k = one.name, 2
         while key == "pads" or tables.get(key, one).table != one.table:

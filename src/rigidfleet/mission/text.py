@@ -48,7 +48,7 @@ def mission_text(name: str) -> str:
         There is no shipped mission of this name.
     """
     if name not in mission_names():
-        raise MissionError([_not_found(name)])
+        raise MissionError([_unknown_mission(name)])
     return (_SHIPPED / f"{name}.toml").read_text(encoding="utf-8")
 
 
@@ -66,7 +66,7 @@ def read_text(path: str | Path) -> str:
         with open(path, "rb") as file:
             data = file.read(bounds.BYTES + 1)
     except FileNotFoundError:
-        raise MissionError([_not_found(origin)]) from None
+        raise MissionError([_unknown_mission(origin)]) from None
     except IsADirectoryError:
         raise read_error(origin, "is a folder", "give the path of a mission file in it") from None
     except PermissionError:
@@ -90,7 +90,7 @@ def read_error(origin: str, problem: str, remedy: str) -> MissionError:
     return MissionError([Finding(origin, "", None, problem, remedy)])
 
 
-def _not_found(name: str) -> Finding:
+def _unknown_mission(name: str) -> Finding:
     known = mission_names()
     remedy = suggest(Path(name).stem, known) or f"shipped missions: {', '.join(known)}"
     return Finding(name, "", None, "no such file and no shipped mission of this name", remedy)
@@ -104,7 +104,7 @@ def parse_toml(text: str, origin: str) -> dict[str, Any]:
     MissionError
         The text is not valid TOML or exceeds the bounds on the text of a mission.
     """
-    if beyond := bounds.excess(text):
+    if beyond := bounds.excess_in_words(text):
         raise read_error(origin, beyond, "reduce it; docs/missions.md lists the bounds")
     try:
         return tomllib.loads(text)

@@ -37,36 +37,36 @@ Number = Annotated[float, Strict(), Field(ge=-HUGE, le=HUGE)]
 Positive = Annotated[float, Strict(), Field(gt=0, le=HUGE)]
 
 
-def of_either_sign(bound: Bound, power: int = 1) -> Any:
+def signed_number(bound: Bound, power: int = 1) -> Any:
     """A number of either sign within the bound, or its power."""
     return Field(ge=-(bound.most**power), le=bound.most**power)
 
 
-def _positive(bound: Bound) -> Any:
+def _positive_number(bound: Bound) -> Any:
     return Field(ge=bound.least, le=bound.most)
 
 
-def from_zero(bound: Bound) -> Any:
+def number_from_zero(bound: Bound) -> Any:
     """A number from zero up to the bound."""
     return Field(ge=0, le=bound.most)
 
 
-Coordinate = Annotated[float, Strict(), of_either_sign(LENGTH)]
-Length = Annotated[float, Strict(), _positive(LENGTH)]
-LengthOrZero = Annotated[float, Strict(), from_zero(LENGTH)]
-Time = Annotated[float, Strict(), _positive(TIME)]
+Coordinate = Annotated[float, Strict(), signed_number(LENGTH)]
+Length = Annotated[float, Strict(), _positive_number(LENGTH)]
+LengthOrZero = Annotated[float, Strict(), number_from_zero(LENGTH)]
+Time = Annotated[float, Strict(), _positive_number(TIME)]
 #: A time of the mission, from its start on.
-Seconds = Annotated[float, Strict(), from_zero(TIME)]
-Speed = Annotated[float, Strict(), _positive(SPEED)]
-Spread = Annotated[float, Strict(), from_zero(SPEED)]
-Acceleration = Annotated[float, Strict(), _positive(ACCELERATION)]
-Jerk = Annotated[float, Strict(), _positive(JERK)]
-Mass = Annotated[float, Strict(), _positive(MASS)]
-Angle = Annotated[float, Strict(), of_either_sign(ANGLE)]
-Gain = Annotated[float, Strict(), of_either_sign(GAIN)]
-Weight = Annotated[float, Strict(), from_zero(WEIGHT)]
-Cost = Annotated[float, Strict(), _positive(WEIGHT)]
-Tolerance = Annotated[float, Strict(), _positive(TOLERANCE)]
+Seconds = Annotated[float, Strict(), number_from_zero(TIME)]
+Speed = Annotated[float, Strict(), _positive_number(SPEED)]
+Spread = Annotated[float, Strict(), number_from_zero(SPEED)]
+Acceleration = Annotated[float, Strict(), _positive_number(ACCELERATION)]
+Jerk = Annotated[float, Strict(), _positive_number(JERK)]
+Mass = Annotated[float, Strict(), _positive_number(MASS)]
+Angle = Annotated[float, Strict(), signed_number(ANGLE)]
+Gain = Annotated[float, Strict(), signed_number(GAIN)]
+Weight = Annotated[float, Strict(), number_from_zero(WEIGHT)]
+Cost = Annotated[float, Strict(), _positive_number(WEIGHT)]
+Tolerance = Annotated[float, Strict(), _positive_number(TOLERANCE)]
 #: Infinity is allowed here; a later check rejects it with its own remedy.
 Limit = Annotated[float, Strict(), Field(ge=FORCE.least, allow_inf_nan=True)]
 Whole = Annotated[int, Strict(), Field(ge=-(2**31), lt=2**31)]
@@ -96,10 +96,10 @@ _ValueOrWord = Annotated[
 ]
 _Two, _Three = (Field(min_length=n, max_length=n) for n in (2, 3))
 Vector = Annotated[tuple[Coordinate, ...], _Three]
-Velocity = Annotated[tuple[Annotated[float, Strict(), of_either_sign(SPEED)], ...], _Three]
+Velocity = Annotated[tuple[Annotated[float, Strict(), signed_number(SPEED)], ...], _Three]
 #: A velocity, or "free": any.
 VelocityOrFree = _ValueOrWord[Velocity, Literal["free"]]
-Force = Annotated[tuple[Annotated[float, Strict(), of_either_sign(FORCE)], ...], _Three]
+Force = Annotated[tuple[Annotated[float, Strict(), signed_number(FORCE)], ...], _Three]
 Rates = Annotated[tuple[Angle, ...], _Three]
 Weights = Annotated[tuple[Weight, ...], _Two]
 Size = _OneOrList[Length, Annotated[tuple[Length, ...], _Three]]

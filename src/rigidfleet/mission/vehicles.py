@@ -79,7 +79,7 @@ class VehicleModel(NamedTuple):
         return (across, across, along)
 
 
-def _models() -> dict[str, dict[str, tuple[Any, str]]]:
+def _model_numbers() -> dict[str, dict[str, tuple[Any, str]]]:
     """The numbers of each model by key, each with its source."""
     tables = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
     for table in tables.values():
@@ -88,13 +88,13 @@ def _models() -> dict[str, dict[str, tuple[Any, str]]]:
     return tables
 
 
-MODELS = _models()
+MODELS = _model_numbers()
 
 #: Keys that only a point has, and those of a quadrotor in their place.
 _OF_POINTS = {"thrust_limit": "thrust_coefficient", "drag": "rotor_drag"}
 
 
-def resolve(vehicle: Vehicle) -> VehicleModel:
+def model_of_vehicle(vehicle: Vehicle) -> VehicleModel:
     """The model of a checked table, with what the table gives in place of the model's own numbers."""
     own = {
         key: value
@@ -121,12 +121,12 @@ def validate_vehicles(m: Draft) -> None:
             m.add(path, "is not a table", f"write a table [vehicles.{name}]")
         elif (vehicle := m.validate(Vehicle, data, path)) is not None:
             before = len(m.findings)
-            m.record_breaches(path, _model(vehicle))
+            m.record_breaches(path, _vehicle_rules(vehicle))
             if len(m.findings) == before:
                 m.vehicles[name] = vehicle
 
 
-def _model(vehicle: Vehicle) -> Breaches:
+def _vehicle_rules(vehicle: Vehicle) -> Breaches:
     """The keys of a table suit its model, and its vehicle can hover."""
     if vehicle.model == "point":
         for key in Vehicle.model_fields:
@@ -142,7 +142,7 @@ def _model(vehicle: Vehicle) -> Breaches:
         yield Breach(key, "is for points alone", remedy)
     if wrong:
         return
-    x = resolve(vehicle)
+    x = model_of_vehicle(vehicle)
     low, high = x.rotor_speed
     if low >= high:
         yield Breach("rotor_speed", "the least speed is not below the greatest", "swap them")
@@ -166,7 +166,7 @@ def _model(vehicle: Vehicle) -> Breaches:
         yield Breach("attitude_gains", problem, remedy, list(x.attitude_gains))
 
 
-def fleet_table(m: Draft, agents: Any) -> Any:
+def fill_agents_table(m: Draft, agents: Any) -> Any:
     """The table [agents], with masses and thrust limits of its vehicles; None if they cannot be known."""
     if not isinstance(agents, dict) or "vehicle" not in agents:
         if m.vehicles and isinstance(agents, dict):
@@ -204,7 +204,7 @@ def fleet_table(m: Draft, agents: Any) -> Any:
         m.add(("agents", "saturate"), problem, "remove it")
     if not set(names) <= set(m.vehicles):
         return None  # has errors of its own
-    models = {name: resolve(m.vehicles[name]) for name in set(names)}
+    models = {name: model_of_vehicle(m.vehicles[name]) for name in set(names)}
     own = {
         "vehicle": names,
         "mass": [models[name].mass for name in names],
@@ -220,7 +220,7 @@ NOT_SAMPLED = (
 )
 
 
-def flight_rules(m: Draft) -> Breaches:
+def vehicle_flight_rules(m: Draft) -> Breaches:
     """Vehicles have nothing beside them that they cannot have, and rates that go together."""
     if not m.flies_vehicles:
         for key in ("integral", "drag_feedforward"):

@@ -35,8 +35,8 @@ from rigidfleet.mission.obstacles import Sphere, is_ground
 from rigidfleet.planning.certificate import (
     CLOSE,
     Certificate,
+    certificate_in_step,
     certificate_of,
-    in_step,
     of_ways,
 )
 from rigidfleet.planning.clearance import greatest_way
@@ -153,12 +153,12 @@ class Abort:
     slows: float = 0.0
 
     @property
-    def way(self) -> str:
+    def way_text(self) -> str:
         """How the vehicles go home; "" if no way is proved."""
         return self.home.way
 
     @property
-    def reason(self) -> str:
+    def why_no_way(self) -> str:
         """Why there is no way that is proved; "" if there is one."""
         return self.home.reason
 
@@ -168,7 +168,7 @@ class Abort:
         return self.begins + self.waits + self.slows
 
     @property
-    def end(self) -> float:
+    def rest_time(self) -> float:
         """When all vehicles rest [s]."""
         return self.begins + sum(step.duration for step in self.steps)
 
@@ -184,12 +184,12 @@ class Abort:
 
     def positions_at(self, time: Floats) -> Floats:
         """Positions (K, N, 3) [m] at mission times (K,) [s] from `begins` on; at rest after the last step."""
-        return _concatenate([step.way for step in self.steps]).at(
-            np.minimum(time, self.end) - self.begins
+        return _concatenate_curves([step.way for step in self.steps]).at(
+            np.minimum(time, self.rest_time) - self.begins
         )
 
 
-def _concatenate(curves: Sequence[Piecewise]) -> Piecewise:
+def _concatenate_curves(curves: Sequence[Piecewise]) -> Piecewise:
     """Curves from 0 [s], one after the other, with 8 powers."""
     ends = np.cumsum([0.0, *(float(x.time[-1]) for x in curves)])
     times = [x.time[1:] + t for x, t in zip(curves, ends, strict=False)]
@@ -259,16 +259,16 @@ class Aborts:
     # -- the plan -----------------------------------------------------------------------------------------
 
     @property
-    def end(self) -> float:
+    def plan_end(self) -> float:
         """When the plan ends [s]."""
         return self.legs[-1].end
 
     @property
-    def lands(self) -> bool:
+    def plan_lands(self) -> bool:
         """Whether the plan ends on the ground."""
         return bool(self.legs[-1].phase.lands)
 
-    def leg_at(self, time: float) -> int:
+    def leg_number_at(self, time: float) -> int:
         """Number of the leg at a time [s]; at a switch, of the one before."""
         ends = [x.end for x in self.legs]
         return min(int(np.searchsorted(ends, time)), len(ends) - 1)
@@ -278,7 +278,7 @@ class Aborts:
         """The paths of all vehicles over mission time, pieces (K, N, 3, 8); beyond the end they go on uniformly."""
         times, pieces = [np.zeros(1)], []
         for leg in (x for x in self.legs if x.end > x.start):
-            reference, motion = leg.paths
+            reference, motion = leg.slots_and_motion
             steps = 2 + math.ceil((leg.end - leg.start) / _KNOTS)
             time = np.linspace(leg.start, leg.end, steps)
             own = np.unique([reference.t0 + reference.T_b, *reference.knots, *motion.knots])
@@ -292,33 +292,33 @@ class Aborts:
         return Piecewise(np.concatenate([*times, time[-1:] + 1.0]), np.concatenate([*pieces, on]))
 
     @cached_property
-    def air(self) -> Boundaries:
+    def fall_model(self) -> Boundaries:
         """How vehicles fall, and where to."""
         return Boundaries(self.mission)
 
     @cached_property
-    def astray(self) -> Floats:
+    def fall_uncertainty(self) -> Floats:
         """How far from its fall by the plan each vehicle (N,) may be that is lost [m]."""
-        air = self.air
+        air = self.fall_model
         return self.off + _ASTRAY + _BLOWN * air.k * float(np.linalg.norm(air.wind))
 
     @cached_property
     def wrecks(self) -> list[Sphere]:
         """The lost vehicles, wider by `astray`, which fall from where they were by the plan, and then lie."""
-        air, lost_at, wrecks = self.air, self.mission.lost_at, []
+        air, lost_at, wrecks = self.fall_model, self.mission.lost_at, []
         for i in self.wrecked.tolist():
             states = self.plan.states(lost_at[[i]], 2)
             (r, v), k = states[:, 0, i], air.k[[i]]
-            height = r[2] - air.ends(*states)[:, i, 2] - self.radius[i]
+            height = r[2] - air.ends_of_falls(*states)[:, i, 2] - self.radius[i]
             tau = float(falls.fall_time(height, v[2:], k, air.wind[2], air.g)[0])
             time = np.linspace(0.0, max(tau, SHORTEST), 2 + math.ceil(tau / _FALLING))
-            places = falls.places(r, v, np.minimum(time, tau), float(k[0]), air.wind, air.g)
+            places = falls.fall_places(r, v, np.minimum(time, tau), float(k[0]), air.wind, air.g)
             moves = {"waypoints": places.tolist(), "times": (lost_at[i] + time).tolist()}
-            size = float(self.radius[i] + self.astray[i])
+            size = float(self.radius[i] + self.fall_uncertainty[i])
             wrecks.append(Sphere(kind="sphere", name=f"lost agent {i + 1}", radius=size, **moves))
         return wrecks
 
-    def _way_along(self, clock: Piecewise) -> Piecewise:
+    def _ways_by_clock(self, clock: Piecewise) -> Piecewise:
         """The ways of all vehicles along the plan by a clock, either way."""
         duration, plan = float(clock.time[-1]), self.plan
         time = np.linspace(0.0, duration, 2 + math.ceil(duration / _KNOTS))
@@ -329,16 +329,16 @@ class Aborts:
         fine = np.linspace(0.0, duration, 50 * len(time))
         time = refine_knots(time, np.interp(inside, clock.at(fine)[turn], fine[turn]), _NEAR)
         s = clock.states(time, 4)
-        ends = tuple(x[:, turn] for x in plan.refine(s[0, turn]).ends(4))[turn]
+        ends = tuple(x[:, turn] for x in plan.refine(s[0, turn]).states_at_ends(4))[turn]
         rates = s[1:, :-1], s[1:, 1:]
         return Piecewise.of_ends(time, *map(_states_by_clock, ends, rates))
 
-    def step_along(self, name: str, clock: Piecewise) -> Step:
+    def step_by_clock(self, name: str, clock: Piecewise) -> Step:
         """A step along the plan by a clock, either way: its least separation is that which the legs it meets prove."""
         begin, end = clock.at(clock.time[[0, -1]]).tolist()
         first, last = sorted((begin, end))
-        make, least = partial(self._way_along, clock), _APART_FOR_EVER
-        for leg in self.legs[self.leg_at(first) : self.leg_at(last) + 1]:
+        make, least = partial(self._ways_by_clock, clock), _APART_FOR_EVER
+        for leg in self.legs[self.leg_number_at(first) : self.leg_number_at(last) + 1]:
             proved = leg.certificate
             if self.lost.any():
                 proved = certificate_of(leg.phase, leg.reference, leg.radius, self.lost)
@@ -369,14 +369,14 @@ class Aborts:
         v = self.plan.states(np.array([begins]), 2)[1, 0, self.left]
         speed = float(np.linalg.norm(v, axis=1).max())
         first = max(_STEEPEST * speed / BRAKING, math.sqrt(_BENT * speed / JERK))
-        time, over = self._time_along(
+        time, over = self._least_time_along(
             first, self.limits, lambda time: _path_clock(begins, time, _SLOWING)
         )
-        if begins + 0.5 * time >= self.end and self.lands:
+        if begins + 0.5 * time >= self.plan_end and self.plan_lands:
             # What goes on beyond the end goes on down.
-            clock = _path_clock(begins, max(self.end - begins, _LEAST), _ON)
-            return self.step_along("to its end", clock), ""
-        problem, step = "", self.step_along("slow down", _path_clock(begins, time, _SLOWING))
+            clock = _path_clock(begins, max(self.plan_end - begins, _LEAST), _ON)
+            return self.step_by_clock("to its end", clock), ""
+        problem, step = "", self.step_by_clock("slow down", _path_clock(begins, time, _SLOWING))
         if over.max(initial=0.0) > _KEPT:
             q = self.limits[int(over.argmax())].of
             problem = f"slowing down would break the limit of {q.name_in_words}"
@@ -385,7 +385,7 @@ class Aborts:
             problem = f"the plan itself leads {who} within {max(least, 0.0):.2f} m of each other"
         return step, problem
 
-    def _time_along(
+    def _least_time_along(
         self, first: float, limits: list[Limit], clock: Callable[[float], Piecewise]
     ) -> tuple[float, Floats]:
         """`least_time` of a step along the plan by a clock of a time; where the plan exceeds a limit, that counts."""
@@ -394,14 +394,14 @@ class Aborts:
         def excess(time: float) -> Floats:
             at, *rates = clock(time).states(time * share, 4)
             states = self.plan.states(at, 4)
-            allowed = np.maximum(self._shares(limits, states), _USED)
-            return self._shares(limits, _states_by_clock(states, np.array(rates))) / allowed
+            allowed = np.maximum(self._limit_shares(limits, states), _USED)
+            return self._limit_shares(limits, _states_by_clock(states, np.array(rates))) / allowed
 
-        return least_time(first, excess)
+        return shortest_time(first, excess)
 
     # -- what a step keeps --------------------------------------------------------------------------------
 
-    def _shares(self, limits: list[Limit], x: Floats) -> Floats:
+    def _limit_shares(self, limits: list[Limit], x: Floats) -> Floats:
         """Greatest share (L,) of each limit in states (orders, K, N, 3), of those left."""
         who, x = self.left, x.swapaxes(0, 1)[:, :, self.left]
         return np.array([(q.values(x, who) / q.most[who]).max() for q in limits])
@@ -423,19 +423,19 @@ class Aborts:
         apart = np.linalg.norm(push - push.mean(axis=1, keepdims=True), axis=2)
         return self.off + 2.0 * _OVERSHOOT * float(apart.max())
 
-    def _straight(self, name: str, start: Floats, end: Floats) -> Step:
+    def _straight_step(self, name: str, start: Floats, end: Floats) -> Step:
         """The step of straight ways (N, 3) [m], from rest to rest and in step, in the least time that keeps limits."""
         states = _rest_to_rest(start, end, 1.0).states(np.linspace(0.0, 1.0, _LOOKS), 4)
-        allowed = np.maximum(self._shares(self.home_limits, 0.0 * states), _USED)  # at rest
+        allowed = np.maximum(self._limit_shares(self.home_limits, 0.0 * states), _USED)  # at rest
 
         def excess(time: float) -> Floats:
             moves = states * time ** -np.arange(4.0)[:, None, None, None]
-            return self._shares(self.home_limits, moves) / allowed
+            return self._limit_shares(self.home_limits, moves) / allowed
 
         lands = name == "down"
         longest = float(np.linalg.norm(end - start, axis=1).max())
-        time, _ = least_time(_FASTEST * longest / (DESCENT if lands else SPEED), excess)
-        least = in_step(start, end, time, self.radius, self.lost) or _APART_FOR_EVER
+        time, _ = shortest_time(_FASTEST * longest / (DESCENT if lands else SPEED), excess)
+        least = certificate_in_step(start, end, time, self.radius, self.lost) or _APART_FOR_EVER
         return self._step(name, partial(_rest_to_rest, start, end, time), least, 0.0, lands=lands)
 
     def obstruction(self, step: Step, begin: float) -> str:
@@ -521,10 +521,10 @@ class Aborts:
             def clock(time: float, far: float = far) -> Piecewise:
                 return _path_clock(path, time, -far / time * _BLEND)
 
-            time, _ = self._time_along(_FASTEST * far, self.home_limits, clock)
+            time, _ = self._least_time_along(_FASTEST * far, self.home_limits, clock)
             home = self.straight_ways_home(self.plan.at(np.array([path - far]))[0], begin + time)
             if home.way:
-                step = self.step_along("back", clock(time))
+                step = self.step_by_clock("back", clock(time))
                 if not self.obstruction(step, begin):
                     yield Home((step, *home.steps), f"back along the plan, and {home.way}")
 
@@ -543,7 +543,7 @@ class Aborts:
             problem, t = "", begin
             for name, a, b in self._landing_ways(way, r, goal, off):
                 if np.abs(b - a).max() > 1e-9:
-                    steps.append(self._straight(name, a, b))
+                    steps.append(self._straight_step(name, a, b))
                     problem = problem or self.obstruction(steps[-1], t)
                     t += steps[-1].duration
             if not problem:
@@ -566,7 +566,7 @@ class Aborts:
             q = self._free_places(r, q)
             goal[left] = q[assign_slots(p, q, turn=np.eye(3), metric=metric).order]
         if way == "by levels":
-            height = _levels(self.apart + off, p, q) * (self.below + off)
+            height = _altitude_levels(self.apart + off, p, q) * (self.below + off)
             height += max(q[:, 2].max() + FINAL, p[:, 2].mean() - 0.5 * height.max())
             one, two = r.copy(), goal.copy()
             one[left, 2] = two[left, 2] = height
@@ -610,23 +610,25 @@ class Aborts:
 
     def all_aborts(self) -> Iterator[Abort]:
         """The abort of each `step` of the flight."""
-        end = self.end - self.options.reaction
+        end = self.plan_end - self.options.reaction
         for k in range(1 + max(0, math.floor(end / self.options.step - 1e-9))):
             yield self.abort_at(k * self.options.step)
 
     def abort_at(self, ordered: float) -> Abort:
         """What follows from an order at a time [s]."""
-        return self._of_leavers(ordered) if self.options.agents else self._for_all(ordered)
+        return (
+            self._abort_of_leavers(ordered) if self.options.agents else self._abort_of_all(ordered)
+        )
 
-    def _for_all(self, ordered: float) -> Abort:
+    def _abort_of_all(self, ordered: float) -> Abort:
         """What follows for all at once."""
         begins = ordered + self.options.reaction
-        phase = self.legs[self.leg_at(begins)].phase
+        phase = self.legs[self.leg_number_at(begins)].phase
         if phase.control != "tracking":
             reason = f"only tracked slots can slow down, and '{phase.name}' tracks none"
             return Abort(ordered, begins, (), Home(reason=reason))
         step, problem = self.slow_down(begins)
-        if self.lands and step.path is not None and step.path > self.end - 1e-6:
+        if self.plan_lands and step.path is not None and step.path > self.plan_end - 1e-6:
             return Abort(ordered, begins, (step,), Home((), "lands as planned"))
         if problem := problem or self.obstruction(step, begins):
             return Abort(ordered, begins, (step,), Home(reason=problem))
@@ -634,26 +636,30 @@ class Aborts:
         return Abort(ordered, begins, (step, *home.steps), home, 0.0, step.duration)
 
     @cached_property
-    def _leavers(self) -> Aborts:
+    def _aborts_of_leavers(self) -> Aborts:
         """The aborts of those that leave, who land where the plan leads them, if it lands."""
         stay = np.ones(self.mission.n_agents, dtype=np.bool_)
         stay[np.array(self.options.agents) - 1] = False
         alone = Aborts(self.mission, self.legs, stay | self.lost)
         alone.wrecked, alone.moves = self.wrecked, self.moves
-        if self.lands:
-            alone.start = self.plan.at(np.array([self.end]))[0]
+        if self.plan_lands:
+            alone.start = self.plan.at(np.array([self.plan_end]))[0]
         return alone
 
-    def _of_leavers(self, ordered: float) -> Abort:
+    def _abort_of_leavers(self, ordered: float) -> Abort:
         """Some vehicles go home, as soon as they come near no other one; the others fly the plan on."""
-        begins, end, who = ordered + self.options.reaction, self.end, self._leavers.left
+        begins, end, who = (
+            ordered + self.options.reaction,
+            self.plan_end,
+            self._aborts_of_leavers.left,
+        )
         order = np.concatenate([who, np.setdiff1d(self.left, who)])
         problem = "there is no time left"
-        plan = self.step_along("", _path_clock(begins, max(end - begins, SHORTEST), _ON)).least
+        plan = self.step_by_clock("", _path_clock(begins, max(end - begins, SHORTEST), _ON)).least
         for waits in np.arange(0.0, end - begins, self.options.step).tolist():
-            alone = self._leavers._for_all(ordered + waits)
-            if alone.reason:
-                problem = alone.reason
+            alone = self._aborts_of_leavers._abort_of_all(ordered + waits)
+            if alone.why_no_way:
+                problem = alone.why_no_way
                 continue
             make = partial(self._with_others, begins, waits, alone.steps)
             way = make()
@@ -671,16 +677,16 @@ class Aborts:
 
     def _with_others(self, begins: float, waits: float, steps: Sequence[Step]) -> Piecewise:
         """The ways from a time on [s] of those that wait so long and then fly steps, and of the others, by the plan."""
-        last = np.array([max(begins, self.end - _TOUCHING), self.end])
+        last = np.array([max(begins, self.plan_end - _TOUCHING), self.plan_end])
         states = self.plan.states(last, 4)
         states[1:, 1] = 0.0  # a landing ends with the speed at which it touches down
-        ways = [Piecewise.hermite(last, states).later(-last[0])]
+        ways = [Piecewise.hermite(last, states).shift_time(-last[0])]
         if last[0] > begins:
-            ways.insert(0, self.plan.between(begins, last[0]).later(-begins))
-        on = _concatenate(ways)
+            ways.insert(0, self.plan.between(begins, last[0]).shift_time(-begins))
+        on = _concatenate_curves(ways)
         before = [on.between(0.0, waits)] if waits else []
-        own = _concatenate([*before, *(step.way for step in steps)])
-        knots, who = common_knots([own, on]), self._leavers.left
+        own = _concatenate_curves([*before, *(step.way for step in steps)])
+        knots, who = common_knots([own, on]), self._aborts_of_leavers.left
         own, way = (x.refine(knots, stays=True) for x in (own, on))
         way.pieces[:, who] = own.pieces[:, who]
         return way
@@ -696,7 +702,7 @@ class Aborts:
 
         left, (least, most, each) = self.left, _SAMPLED
         step = min(max(least, each * self.mission.n_agents), most)
-        time = np.arange(abort.begins, min(abort.end, self.end), step)
+        time = np.arange(abort.begins, min(abort.rest_time, self.plan_end), step)
         if len(left) < 2 or not len(time):
             return []
         on, others = self.plan.at(time)[:, left], abort.positions_at(time)[:, left]
@@ -711,7 +717,7 @@ class Aborts:
         ]
 
 
-def least_time(
+def shortest_time(
     time: float, excess: Callable[[float], Floats], kept: float = _KEPT
 ) -> tuple[float, Floats]:
     """The least time from a first one on [s], to within a tenth, that exceeds no limit, and the shares that it takes.
@@ -735,7 +741,7 @@ def gentle_limits(mission: Mission, **most: float) -> list[Limit]:
     return limits_of(mission, own.model_copy(update=less))
 
 
-def _levels(distance: float, p: Floats, q: Floats) -> Ints:
+def _altitude_levels(distance: float, p: Floats, q: Floats) -> Ints:
     """Level (N,) of each vehicle, from 0: others on ways across that come nearer than a distance [m] get another one.
 
     Of two that are one above the other at first, the higher one gets the higher level.
@@ -785,7 +791,7 @@ def state_to_leave(legs: Sequence[Leg], now: PhaseState) -> PhaseState:
     The virtual body is their mean and no longer turns; no formation outlasts it.
     """
     leg = next((x for x in legs if x.end >= now.t), legs[-1])
-    x = slot_derivatives(*leg.paths, np.array([now.t]), 4)[0]
+    x = slot_derivatives(*leg.slots_and_motion, np.array([now.t]), 4)[0]
     mean = np.einsum("i,kiq->kq", leg.masses / leg.masses.sum(), x)
     r, v, a, jerk = mean
     assert now.pose is not None

@@ -7,12 +7,12 @@ import numpy as np
 from rigidfleet.kernel import avoidance, fleet
 from rigidfleet.mission import Mission
 from rigidfleet.mission.avoidance import (
-    braking_accelerations,
     extra_radii,
     reaction_lags,
     reaction_times,
+    spare_accelerations,
 )
-from rigidfleet.solids.records import join
+from rigidfleet.solids.records import join_solids
 
 
 def avoidance_in_flight(
@@ -27,12 +27,12 @@ def avoidance_in_flight(
     if separation is None:
         separation = mission.limits.separation or 0.0
     limit = np.array([model.thrust_limit for model in models])
-    solids = join([thing.solid for thing in mission.obstacles])
+    solids = join_solids([thing.solid for thing in mission.obstacles])
     reach = np.inf if settings.sensing_range is None else settings.sensing_range
     drag = np.where([model.point for model in models], mission.drag / mass, 0.0)
     return avoidance.avoidance_arrays(
         period=flight.every * flight.steps * flight.h,
-        b=braking_accelerations(models, mission.gravity, mission.disturbances),
+        b=spare_accelerations(models, mission.gravity, mission.disturbances),
         lift=limit / mass,
         mass=mass,
         g=mission.gravity,

@@ -90,15 +90,15 @@ class Detour:
         )
         return Detour(x, Q, spin[1:], scale)
 
-    def series(self) -> tuple[Floats, Floats, Floats]:
+    def taylor_series(self) -> tuple[Floats, Floats, Floats]:
         """Taylor series of displacement (3, 3), rotation (3, 3, 3), body to world, and scale (3,)."""
         # In the axes of Q, in which the derivative of the rates is the same.
         own = self.omega @ self.Q
-        Q = series.from_rates(self.Q, own)
+        Q = series.rotation_series_from_rates(self.Q, own)
         return series.from_derivatives(self.x), Q, series.from_derivatives(self.scale)
 
 
-def least_distance(G: Floats, h: Floats) -> Floats | None:
+def least_norm_solution(G: Floats, h: Floats) -> Floats | None:
     """The shortest y (n,) with G y >= h, for G (m, n), or None if there is none; Lawson and Hanson, algorithm LDP."""
     from scipy.optimize import nnls  # takes long to load
 
@@ -113,7 +113,7 @@ def least_distance(G: Floats, h: Floats) -> Floats | None:
     return -r[:-1] / r[-1]
 
 
-def rigid_rows(normals: Floats, arms: Floats, scale: float) -> Floats:
+def rigid_motion_rows(normals: Floats, arms: Floats, scale: float) -> Floats:
     """Rows (R, 7) of n . a of points at arms (R, 3) from the body's origin, along unit normals (R, 3)."""
     along = (normals * arms).sum(axis=1, keepdims=True)
     return np.hstack([normals, np.cross(arms, normals), along / scale])
@@ -143,11 +143,11 @@ def nearest_accelerations(
     L = np.linalg.cholesky(H)
     G = np.linalg.solve(L, rows.T).T
     size = np.linalg.norm(G, axis=1)
-    y = least_distance(G / size[:, None], (needed - rows @ accelerations) / size)
+    y = least_norm_solution(G / size[:, None], (needed - rows @ accelerations) / size)
     return None if y is None else accelerations + np.linalg.solve(L.T, y)
 
 
-def scale_rows(deviation: Detour) -> tuple[Floats, Floats]:
+def scale_bound_rows(deviation: Detour) -> tuple[Floats, Floats]:
     """Rows (2, 7) and what they need (2,), so that the scale stays between its bounds."""
     value, rate, _ = deviation.scale
     rows, needed = np.zeros((2, 7)), np.zeros(2)
@@ -157,7 +157,7 @@ def scale_rows(deviation: Detour) -> tuple[Floats, Floats]:
     return rows, needed
 
 
-def greatest_acceleration(change: Floats, arms: Floats, scale: float) -> float:
+def greatest_point_acceleration(change: Floats, arms: Floats, scale: float) -> float:
     """Greatest |a + alpha x arm + z'' arm / z| [m/s^2] of points at arms (N, 3), of changes (7,)."""
     a = change[:3] + np.cross(change[3:6], arms) + change[6] / scale * arms
     return math.sqrt(float((a * a).sum(axis=1).max()))

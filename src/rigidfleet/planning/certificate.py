@@ -52,19 +52,19 @@ def certificate_of(
     """
     if phase.control != "tracking" or (reference.T_b == 0.0 and reference.dp.any()):
         return None
-    return _of_some(reference, radius, lost)
+    return _prove_some(reference, radius, lost)
 
 
-def in_step(
+def certificate_in_step(
     start: Floats, end: Floats, duration: float, radius: Floats, lost: Bools | None = None
 ) -> Certificate | None:
     """Certificate of straight septic blends (N, 3) [m] in step from 0 on [s]; the rest as `certificate_of`."""
     none, ways = np.zeros(0), end - start
     reference = Reference(SHAPE, 0.0, duration, none, none, start, ways, np.zeros(3))
-    return _of_some(reference, radius, lost)
+    return _prove_some(reference, radius, lost)
 
 
-def _of_some(reference: Reference, radius: Floats, lost: Bools | None) -> Certificate | None:
+def _prove_some(reference: Reference, radius: Floats, lost: Bools | None) -> Certificate | None:
     """Certificate of the slots of vehicles that are not ``lost`` (N,)."""
     left = None if lost is None else np.flatnonzero(~lost)
     if left is not None:
@@ -73,7 +73,7 @@ def _of_some(reference: Reference, radius: Floats, lost: Bools | None) -> Certif
         return None
     some = reference
     certificate = (
-        of_ways(some.knots, some.ways, radius) if len(some.knots) else straight(some, radius)
+        of_ways(some.knots, some.ways, radius) if len(some.knots) else of_blend(some, radius)
     )
     if certificate is None or left is None:
         return certificate
@@ -81,7 +81,7 @@ def _of_some(reference: Reference, radius: Floats, lost: Bools | None) -> Certif
     return certificate._replace(agents=(i, j))
 
 
-def straight(reference: Reference, radius: Floats) -> Certificate | None:
+def of_blend(reference: Reference, radius: Floats) -> Certificate | None:
     """Certificate of slots that blend: relative to the virtual body, all move straight and in step.
 
     How the virtual body moves and turns meanwhile does not matter to distances. None for a single agent.
@@ -89,7 +89,7 @@ def straight(reference: Reference, radius: Floats) -> Certificate | None:
     p, dp = reference.p0, reference.dp
     if len(p) < 2:
         return None
-    least = _least if p.nbytes < _KEPT else _least.__wrapped__
+    least = _closest_of_blend if p.nbytes < _KEPT else _closest_of_blend.__wrapped__
     separation, pair, share = least(p.tobytes(), dp.tobytes(), radius.tobytes())
     time = reference.t0
     if share > 0.0:
@@ -98,7 +98,7 @@ def straight(reference: Reference, radius: Floats) -> Certificate | None:
 
 
 @lru_cache(64)
-def _least(p: bytes, dp: bytes, radius: bytes) -> tuple[float, tuple[int, int], float]:
+def _closest_of_blend(p: bytes, dp: bytes, radius: bytes) -> tuple[float, tuple[int, int], float]:
     """`closest_approach` of slots that blend or stay, cached because most phases have the slots of the one before."""
     start, ways = (np.frombuffer(x).reshape(-1, 3) for x in (p, dp))
     r = np.frombuffer(radius)

@@ -14,7 +14,7 @@ import numpy as np
 
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import proximity, series
-from rigidfleet.math.piecewise import piece_at
+from rigidfleet.math.piecewise import piece_index
 from rigidfleet.mission import Obstacle
 from rigidfleet.planning.derivatives import reference_of_agents, slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
@@ -56,8 +56,8 @@ def greatest_speeds(reference: Reference, motion: Motion, begin: Floats, end: Fl
 
 def _bounds(knots: Floats, ways: Floats, begin: Floats, end: Floats) -> tuple[Floats, Floats]:
     """Upper bounds (L, n) of size and rate of polynomials (K, n, 3, P) over spans, from ``begin`` to ``end`` (L,)."""
-    first = piece_at(knots, begin)
-    last = np.maximum(piece_at(knots, end, "left"), first)
+    first = piece_index(knots, begin)
+    last = np.maximum(piece_index(knots, end, "left"), first)
     size = rate = np.zeros((len(begin), ways.shape[1]))
     for k in range(int((last - first).max(initial=0)) + 1):
         piece = np.minimum(first + k, last)
@@ -66,7 +66,7 @@ def _bounds(knots: Floats, ways: Floats, begin: Floats, end: Floats) -> tuple[Fl
         x = series.of_polynomials(ways[piece], (low + high) / 2 - knots[piece], ways.shape[-1])
         powers = half ** np.arange(float(len(x)))[:, None]
         far = (np.linalg.norm(x, axis=-1) * powers[..., None]).sum(axis=0)
-        fast = (np.linalg.norm(series.rate(x), axis=-1) * powers[:-1, :, None]).sum(axis=0)
+        fast = (np.linalg.norm(series.differentiate(x), axis=-1) * powers[:-1, :, None]).sum(axis=0)
         size, rate = np.maximum(size, far), np.maximum(rate, fast)
     return size, rate
 
@@ -74,7 +74,7 @@ def _bounds(knots: Floats, ways: Floats, begin: Floats, end: Floats) -> tuple[Fl
 def speed_bounds(planned: PlannedPhase) -> Floats:
     """Bounds (K - 1, N) [m/s] of the speeds between the samples of a planned phase."""
     time = planned.time
-    return greatest_speeds(*planned.leg.paths, time[:-1], time[1:])
+    return greatest_speeds(*planned.leg.slots_and_motion, time[:-1], time[1:])
 
 
 class Closest(NamedTuple):
@@ -110,7 +110,7 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
     ``speed`` is the `speed_bounds` of the phase. Where the room between two samples might not do, the plan is evaluated
     in the middle, and so on.
     """
-    (reference, motion), solid = planned.leg.paths, thing.solid
+    (reference, motion), solid = planned.leg.slots_and_motion, thing.solid
     time, position = planned.time, planned.position
     if np.isfinite(solid.there).any():
         time, position, speed = _path_while_present(planned, *solid.there[0].tolist(), speed)
@@ -168,9 +168,9 @@ def _path_while_present(
     if ends[0] > ends[1]:
         return time[:0], planned.position[:0], speed[:0]
     within = (time > ends[0]) & (time < ends[1])
-    first, last = slot_derivatives(*planned.leg.paths, ends, 1)[:, :1]
+    first, last = slot_derivatives(*planned.leg.slots_and_motion, ends, 1)[:, :1]
     at = np.concatenate([ends[:1], time[within], ends[1:]])
-    span = piece_at(time, at[:-1])
+    span = piece_index(time, at[:-1])
     return at, np.concatenate([first, planned.position[within], last]), speed[span]
 
 

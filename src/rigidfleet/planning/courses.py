@@ -154,7 +154,7 @@ def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) 
     arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
     up, v, lift = np.zeros(3), np.zeros(3), None
     if phase.each:
-        rise, masses = rises(mission, phase, now), mission.fleet.mass
+        rise, masses = climb_heights(mission, phase, now), mission.fleet.mass
         up[2] = masses @ rise / masses.sum()
         if np.ptp(rise) >= _LEVEL:
             travel = min(phase.travel or math.inf, t_end - now.t)
@@ -199,7 +199,7 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
         if begin[1:, 3:].any():
             # The slots take over the turn of the body: files that go on so are flown as they are.
             turn = series.from_derivatives(np.stack([pose.omega, pose.alpha, pose.alpha_dot]))
-            turn = series.from_rates(np.eye(3), turn).swapaxes(1, 2)
+            turn = series.rotation_series_from_rates(np.eye(3), turn).swapaxes(1, 2)
             start = series.product(series.from_derivatives(start), turn, np.matmul)
             start, begin[1:, 3:] = series.derivatives(start), 0.0
         own = Piecewise(knots, ways).start_from(start, fade)
@@ -258,7 +258,7 @@ def _vehicle_mismatch(phase: Follow, now: PhaseState) -> str:
     return ""
 
 
-def rises(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
+def climb_heights(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     """How far [m] each vehicle (N,) goes up from the pose to hold: to a height, or (down) to just above the ground."""
     (_, goal, slots), n = now.attached, mission.n_agents
     place, ground = goal.r[2] + slots @ goal.T[:, 2], _heights_below(mission, now)

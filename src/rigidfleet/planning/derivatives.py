@@ -91,7 +91,7 @@ def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats)
         )
     s = blend_series(time, reference.t0, reference.T_b)[: len(cm)]
     if reference.turn.any():
-        turned = series.rotation(s[..., None] * reference.turn).transpose(0, 2, 3, 1)
+        turned = series.rotation_series(s[..., None] * reference.turn).transpose(0, 2, 3, 1)
         axes = series.product(axes, turned, _matrix_product)
     slots = reference.p0 @ axes
     if reference.dp.any():
@@ -103,7 +103,7 @@ def way_series(reference: Reference, time: Floats) -> Floats:
     """Taylor series (5, N, 3, K) of slots on their ways, body axes, at times (K,) [s]; at rest before and after."""
     ways = Piecewise(reference.knots, reference.ways)
     inside = np.clip(time, ways.time[0], ways.time[-1])
-    values = ways.series(inside, ORDERS).transpose(0, 2, 3, 1)
+    values = ways.taylor_coefficients(inside, ORDERS).transpose(0, 2, 3, 1)
     values[1:, ..., inside != time] = 0.0
     return values
 
@@ -127,7 +127,7 @@ def body_series(motion: Motion, time: Floats, orders: int = ORDERS) -> tuple[Flo
     """
     way = Piecewise(motion.knots, motion.coefficients)
     inside = np.minimum(time, way.time[-1])
-    x = np.ascontiguousarray(way.series(inside, ORDERS).swapaxes(1, 2))
+    x = np.ascontiguousarray(way.taylor_coefficients(inside, ORDERS).swapaxes(1, 2))
     beyond = time > inside
     x[0][:, beyond] += (time - inside)[beyond] * x[1][:, beyond]
     x[2:, :, beyond] = 0.0
@@ -136,7 +136,7 @@ def body_series(motion: Motion, time: Floats, orders: int = ORDERS) -> tuple[Flo
         axes = np.zeros((orders, 3, 3, 1))
         axes[0] = motion.T1.T[..., None]
         return cm, axes
-    turned = series.rotation(phi.swapaxes(1, 2), orders).transpose(0, 2, 3, 1)
+    turned = series.rotation_series(phi.swapaxes(1, 2), orders).transpose(0, 2, 3, 1)
     return cm, (motion.T1.T @ turned.reshape(orders, 3, -1)).reshape(turned.shape)
 
 
@@ -178,10 +178,10 @@ def yaw_derivatives(
     slots = slot_series(reference, body, time)
     if yaw.kind == "along":
         return yaw_along(reference, motion, time, slots, start)[0].transpose(2, 0, 1)
-    return yaw_of(body, slots, yaw).transpose(2, 0, 1)
+    return yaw_by_kind(body, slots, yaw).transpose(2, 0, 1)
 
 
-def yaw_of(body: tuple[Floats, Floats], slots: Floats, yaw: Yaw) -> Floats:
+def yaw_by_kind(body: tuple[Floats, Floats], slots: Floats, yaw: Yaw) -> Floats:
     """Yaw with two derivatives (3, N, K) of every kind but "along", see `yaw_derivatives`.
 
     From the `body_series` and the `slot_series` at the same times.
@@ -193,11 +193,11 @@ def yaw_of(body: tuple[Floats, Floats], slots: Floats, yaw: Yaw) -> Floats:
         return angles
     if yaw.kind == "formation":
         M = body[1][:3]
-        turned = series.angle(M[:, 1, 0] - M[:, 0, 1], M[:, 0, 0] + M[:, 1, 1])[:, None]
+        turned = series.angle_series(M[:, 1, 0] - M[:, 0, 1], M[:, 0, 0] + M[:, 1, 1])[:, None]
     else:
         away = -slots[:3, :2]
         away[0] += np.array(yaw.point)[:2, None, None]
-        turned = series.angle(away[:, 1], away[:, 0])
+        turned = series.angle_series(away[:, 1], away[:, 0])
     turned[0] = np.unwrap(turned[0])
     angles[:] = series.derivatives(turned)
     return angles
@@ -218,7 +218,7 @@ def yaw_along(
     on_grid = slot_series(reference, body, grid_time)
     if start is None:
         v = on_grid[1, :2, :, 0]
-        from_body = yaw_of(body, on_grid, Yaw())[0, :, 0]
+        from_body = yaw_by_kind(body, on_grid, Yaw())[0, :, 0]
         start = np.where(np.hypot(*v) > SLOW, np.arctan2(v[1], v[0]), from_body)
     terms = np.ascontiguousarray(_yaw_terms(on_grid)[0].transpose(2, 0, 1))  # (times, 3, N)
     between = terms[len(ends) :]

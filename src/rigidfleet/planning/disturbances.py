@@ -13,7 +13,7 @@ import numpy as np
 from rigidfleet.kernel.problem import Disturbance, Problem, graph, no_disturbance
 from rigidfleet.math import turbulence
 from rigidfleet.mission import Gusts, Mission
-from rigidfleet.mission.disturbances import gust_step, intensity
+from rigidfleet.mission.disturbances import gust_intensity, gust_step
 from rigidfleet.planning import filters
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -21,7 +21,7 @@ from rigidfleet.typing import Bools, Floats, Ints
 NOTHING = 1e-20
 
 
-def disturbance(mission: Mission) -> Disturbance:
+def mission_disturbance(mission: Mission) -> Disturbance:
     """Disturbances of a mission from its start to its latest end, with no vehicle lost yet."""
     d = mission.disturbances
     none = no_disturbance(mission.fleet.mass.copy())
@@ -45,7 +45,7 @@ def disturbance(mission: Mission) -> Disturbance:
         )
     if d.noise is not None:
         step = 1.0 / d.noise.rate
-        shape = (_knots(mission, step), 2, mission.n_agents, 3)
+        shape = (_count_knots(mission, step), 2, mission.n_agents, 3)
         white = np.random.default_rng((1, d.noise.seed)).standard_normal(shape)
         r, v = (
             filters.spline_coefficients(white, scale, part)
@@ -55,7 +55,7 @@ def disturbance(mission: Mission) -> Disturbance:
     return out
 
 
-def _knots(mission: Mission, step: float) -> int:
+def _count_knots(mission: Mission, step: float) -> int:
     return math.ceil(mission.latest_end / step) + 2
 
 
@@ -64,14 +64,14 @@ def _gusts(mission: Mission, gusts: Gusts, wind: Floats, step: float) -> Floats:
     n, speed = mission.n_agents, float(np.linalg.norm(wind))
     rng = np.random.default_rng((0, gusts.seed))
     # The two numbers of a sample first, so that those of each filter lie together after the products.
-    white = rng.standard_normal((_knots(mission, step), 2, n + 1, 3)).swapaxes(0, 1)
+    white = rng.standard_normal((_count_knots(mission, step), 2, n + 1, 3)).swapaxes(0, 1)
     if gusts.correlation_length is not None:
         white = turbulence.correlate_by_distance(
-            white[..., :n, :], _places(mission), gusts.correlation_length
+            white[..., :n, :], _relative_places(mission), gusts.correlation_length
         )
     else:
         white = turbulence.correlate_evenly(white, gusts.correlation or 0.0)
-    u, sigma = np.empty(white[0].shape), intensity(gusts, speed)
+    u, sigma = np.empty(white[0].shape), gust_intensity(gusts, speed)
     if gusts.model == "first-order":
         assert gusts.time_scale is not None  # checked on entry
         np.multiply(filters.gauss_markov(white[0], step, gusts.time_scale), sigma, out=u)
@@ -95,7 +95,7 @@ def _wind_axes(wind: Floats) -> Floats:
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _places(mission: Mission) -> Floats:
+def _relative_places(mission: Mission) -> Floats:
     """Relative positions (N, 3) [m] of the agents: in the first formation established, or else at the start."""
     names = (p.establishing.formation for p in mission.phases if p.establishing is not None)
     slots = next((s for s in map(mission.formation_slots, names) if s is not None), None)
@@ -113,7 +113,7 @@ def with_fixed_agents(problem: Problem, fixed: Ints) -> Problem:
     )
 
 
-def without(
+def drop_lost(
     problem: Problem,
     edges: Bools,
     lost: Bools,

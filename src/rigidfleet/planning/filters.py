@@ -38,7 +38,7 @@ def dryden_gust(white: Floats, step: float, tau: float) -> Floats:
     """
     s = step / tau
     a = math.exp(-s)
-    root, low, rest = _shares(s)
+    root, low, rest = _sample_weights(s)
     first, second = white[:, 0], white[:, 1]
     z1, z2 = root * first, low * first
     z2 += rest * second
@@ -53,7 +53,7 @@ def dryden_gust(white: Floats, step: float, tau: float) -> Floats:
     return z1
 
 
-def _shares(s: float) -> tuple[float, float, float]:
+def _sample_weights(s: float) -> tuple[float, float, float]:
     """Shares of the first white sample in z1 and z2, and of the second one in z2: the lower root of P - A P A^T.
 
     The stationary covariances are P = [[1, 1/2], [1/2, 1/2]]. The entries are incomplete gamma functions: for a short
@@ -83,7 +83,7 @@ def _recursion(x: Floats, a: float) -> Floats:
     from rigidfleet.kernel.engine import native  # loads the compiled kernel
 
     z = np.ascontiguousarray(x)
-    native.recurse(z.reshape(len(z), -1), np.full(len(z), a))
+    native.run_linear_recursion(z.reshape(len(z), -1), np.full(len(z), a))
     return z
 
 
@@ -98,14 +98,14 @@ def spline_coefficients(samples: Floats, scale: float = 1.0, part: int | None = 
     n, shape = len(samples), samples.shape[1 if part is None else 2 :]
     flat, width = np.ascontiguousarray(samples).reshape(n, -1), math.prod(shape)
     table = np.empty((n + 2, width))
-    c, (factors, shares) = table[1:-1], _elimination(n)
-    native.recurse_multiples(flat, (part or 0) * width, scale * shares, c, factors)
-    native.recurse(c, factors, backward=True)
+    c, (factors, shares) = table[1:-1], _elimination_factors(n)
+    native.run_scaled_recursions(flat, (part or 0) * width, scale * shares, c, factors)
+    native.run_linear_recursion(c, factors, backward=True)
     table[0], table[-1] = 2.0 * c[0] - c[1], 2.0 * c[-1] - c[-2]
     return table.reshape(n + 2, *shape)
 
 
-def _elimination(n: int) -> tuple[Floats, Floats]:
+def _elimination_factors(n: int) -> tuple[Floats, Floats]:
     """Factors (n,) of the row before in either sweep of the elimination, and shares (n,) of the samples.
 
     Both ends are known: their factors are zero, and their shares one.

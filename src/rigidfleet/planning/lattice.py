@@ -47,15 +47,15 @@ class FreeSpace(NamedTuple):
     obstacles: Sequence[Obstacle]
     fence: Floats
 
-    def room(self, r: Floats, radius: Floats, most: Floats | float = np.inf) -> Floats:
+    def room_at(self, r: Floats, radius: Floats, most: Floats | float = np.inf) -> Floats:
         """Least distance (..., M) [m] of balls at r (..., M, 3) to an obstacle, or of their centres to the fence.
 
         Beyond ``most`` (..., M) [m] the distance does not matter.
         """
-        least = self.room_beside_obstacles(r, radius, most)
+        least = self.room_to_obstacles(r, radius, most)
         return np.minimum(least, np.minimum(r - self.fence[0], self.fence[1] - r).min(axis=-1))
 
-    def room_beside_obstacles(self, r: Floats, radius: Floats, most: Floats | float) -> Floats:
+    def room_to_obstacles(self, r: Floats, radius: Floats, most: Floats | float) -> Floats:
         """The same from obstacles alone."""
         return proximity.obstacle_clearances(r, radius, self.obstacles, most=most)[0]
 
@@ -111,7 +111,7 @@ def keeps_room(
         middle = low + length / 2
         place = a[who] + middle[:, None] * (b - a)[who]
         wanted = need + way[who] * length / 2
-        room = space.room_beside_obstacles(place[:, None] + path(middle), radius, wanted)
+        room = space.room_to_obstacles(place[:, None] + path(middle), radius, wanted)
         free[who[(room < need).any(axis=1)]] = False
         open_ = free[who] & (room < wanted).any(axis=1)
         who, low, length = who[open_], low[open_], length / 2
@@ -144,7 +144,7 @@ class Lattice:
         """
         offsets = layer.offsets @ frame.T
         axes = [
-            _coordinates(
+            _lattice_coordinates(
                 common[k],
                 np.array([_extent(thing, frame)[:, k] for thing in space.obstacles]).reshape(-1, 2),
                 float((offsets[:, k] + radius).max()) + need,
@@ -155,7 +155,7 @@ class Lattice:
         self.layer, self.axes, self.shape = layer, axes, tuple(map(len, axes))
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         self.points = grid @ frame
-        self.room = space.room(self.points[:, None] + layer.offsets, radius, need).min(axis=1)
+        self.room = space.room_at(self.points[:, None] + layer.offsets, radius, need).min(axis=1)
         free = self.room >= need
         index = np.arange(len(grid)).reshape(self.shape)
         tails, heads = [], []
@@ -173,7 +173,7 @@ class Lattice:
         self.free = free
 
 
-def _coordinates(common: Floats, spans: Floats, above: float, below: float) -> Floats:
+def _lattice_coordinates(common: Floats, spans: Floats, above: float, below: float) -> Floats:
     """Coordinates [m] along an axis: common ones, and middles between places where the shape touches a span (B, 2)."""
     low, high = common[0], common[-1]
     touch = np.unique(np.concatenate([spans[:, 0] - above, spans[:, 1] + below]))
@@ -187,13 +187,13 @@ def _coordinates(common: Floats, spans: Floats, above: float, below: float) -> F
 
 def _extent(thing: Obstacle, frame: Floats) -> Floats:
     """Lowest and highest coordinates (2, 3) [m] of an obstacle along the axes of a frame."""
-    solid, ends = thing.solid, records.extent(thing.solid)
+    solid, ends = thing.solid, records.swept_extent(thing.solid)
     if not np.isfinite(ends).all():
         return ends  # all that is below a height, whatever the frame's yaw
     turned = solid._replace(
         turn=solid.turn @ frame.T, origin=solid.origin @ frame.T, turned=np.ones(1, dtype=np.int64)
     )
-    return records.extent(turned)
+    return records.swept_extent(turned)
 
 
 class Way(NamedTuple):
@@ -228,10 +228,10 @@ class Roadmap:
         self.size = int(starts[-1])
         self.points = np.concatenate([x.points for row in self.lattices for x in row])
         self.layer_of = np.repeat(np.tile(np.arange(len(layers)), len(frames)), np.ravel(counts))
-        links = zip(*self._links(), strict=True)
+        links = zip(*self._motion_links(), strict=True)
         self.tails, self.heads, self.costs = map(np.concatenate, links)
 
-    def _links(self) -> Iterator[tuple[Ints, Ints, Floats]]:
+    def _motion_links(self) -> Iterator[tuple[Ints, Ints, Floats]]:
         """Nodes and costs of motions within layers, of changes at common places, of crossings from frame to frame."""
         space, radius, need = self.space, self.radius, self.need
         for f, row in enumerate(self.lattices):
@@ -268,18 +268,18 @@ class Roadmap:
         cost = np.linalg.norm(p - q, axis=1)[good]
         return a[good] + self.first[0, k], b[good] + self.first[f, k], cost
 
-    def node(self, place: Floats, layer: int) -> int:
+    def node_at(self, place: Floats, layer: int) -> int:
         """The node at a place (3,) of a layer in the world's lattice; common coordinates contain it."""
         x = self.lattices[0][layer]
         at = [int(np.abs(x.axes[k] - place[k]).argmin()) for k in range(3)]
         return int(self.first[0, layer] + np.ravel_multi_index(at, x.shape))
 
-    def shortest(self, begin: Stop, end: Stop) -> Way | None:
+    def shortest_way(self, begin: Stop, end: Stop) -> Way | None:
         """The way of least cost from a place and layer to others; None if there is none."""
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import dijkstra
 
-        a, b = self.node(*begin), self.node(*end)
+        a, b = self.node_at(*begin), self.node_at(*end)
         graph = csr_array(
             (np.maximum(self.costs, 1e-9), (self.tails, self.heads)), shape=(self.size, self.size)
         )
@@ -294,11 +294,11 @@ class Roadmap:
             [self.points[k] for k in nodes], [int(self.layer_of[k]) for k in nodes], float(cost[b])
         )
 
-    def shorten(self, way: Way) -> Way:
+    def shorten_way(self, way: Way) -> Way:
         """The way with fewer stops: straight where that is proved, with changes at stops or half-way between them."""
         stops = list(zip(way.places, way.layers, strict=True))
         for _ in range(_SHORTER):
-            stops = self._changed_on_the_way(self._straighten(stops))
+            stops = self._move_changes(self._straighten(stops))
         ends = way.places[0], way.places[-1]
         places = [p if any(p is end for end in ends) else np.round(p, 3) for p, _ in stops]
         return Way(places, [k for _, k in stops], way.cost)
@@ -326,7 +326,7 @@ class Roadmap:
             k += 1
         return stops
 
-    def _changed_on_the_way(self, stops: list[Stop]) -> list[Stop]:
+    def _move_changes(self, stops: list[Stop]) -> list[Stop]:
         """Changes moved to the stop before or after, or half-way between the two, which saves a detour to them."""
         stops, first = list(stops), 1
         while first < len(stops) - 1:
@@ -354,7 +354,7 @@ class Roadmap:
             a, b = x.all_edges
             share = np.linspace(0.0, 1.0, 5)[1:-1]
             between = x.points[a, None] + share[:, None] * (x.points[b] - x.points[a])[:, None]
-            room = self.space.room(between[:, :, None] + x.layer.offsets, self.radius)
+            room = self.space.room_at(between[:, :, None] + x.layer.offsets, self.radius)
             ends = np.minimum(x.room[a], x.room[b])
             yield a + first[k], b + first[k], np.minimum(room.min(axis=(1, 2)), ends)
         for change in self.changes:
@@ -362,7 +362,7 @@ class Roadmap:
             room = np.minimum(one.room[a], two.room[b])
             yield a + first[change.before], b + first[change.after], room
 
-    def widest(self, begin: Stop, end: Stop) -> tuple[float, Floats, int]:
+    def widest_way(self, begin: Stop, end: Stop) -> tuple[float, Floats, int]:
         """The most room [m] that a way between two nodes leaves everywhere, and place and layer where it is least."""
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
@@ -376,7 +376,7 @@ class Roadmap:
         tree = minimum_spanning_tree(
             csr_array((most - room, (tail, head)), shape=(self.size, self.size))
         )
-        a, b = self.node(*begin), self.node(*end)
+        a, b = self.node_at(*begin), self.node_at(*end)
         _, before = breadth_first_order(tree, a, directed=False)
         tree = (tree + tree.T).tocsr()
         at, least = b, (np.inf, b)

@@ -107,14 +107,14 @@ def layer_changes(
     for s, shape in enumerate(shapes):
         for i in range(count):
             for j in range(i + 1, count):
-                if angle_between(angles[i], angles[j]) < _HALF:
+                if angle_between_attitudes(angles[i], angles[j]) < _HALF:
                     yield Change(
                         s * count + i, s * count + j, *_turn_path(shape.slots, angles[i], angles[j])
                     )
     for s, one in enumerate(shapes):
         for t in range(s + 1, len(shapes)):
             for i in range(count):
-                folding = _fold_path(mission, one, shapes[t], angles[i])
+                folding = _shape_change_path(mission, one, shapes[t], angles[i])
                 if folding is not None:
                     yield Change(s * count + i, t * count + i, *folding)
 
@@ -129,7 +129,7 @@ def _turn_path(slots: Floats, before: Angles, after: Angles) -> tuple[Path, Floa
     )
 
 
-def _fold_path(
+def _shape_change_path(
     mission: Mission, one: CandidateShape, two: CandidateShape, angles: Angles
 ) -> tuple[Path, Floats] | None:
     """Offsets and ways of a change of shape, as references blend it; None if agents come too near each other."""
@@ -149,7 +149,7 @@ def _fold_path(
     return path, np.linalg.norm(dp, axis=1) + float(np.linalg.norm(turn)) * lever
 
 
-def angle_between(a: Angles, b: Angles) -> float:
+def angle_between_attitudes(a: Angles, b: Angles) -> float:
     """Angle [rad] between two attitudes."""
     A, B = (att.dcm_from_euler(np.deg2rad(x)) for x in (a, b))
     return float(np.linalg.norm(att.rotation_vector_from_dcm(A @ B.T)))

@@ -96,12 +96,12 @@ class Leg:
     smooth: bool
 
     @property
-    def known(self) -> bool:
+    def has_known_ways(self) -> bool:
         """Whether the way of the agents is known before the flight: distances alone do not say where they lead."""
         return self.knows_slots or self.phase.shaping is None
 
     @property
-    def exact(self) -> bool:
+    def follows_exactly(self) -> bool:
         """Whether the agents follow the plan up to control errors; if not, it is an estimate."""
         # A shape held by constraint forces alone may lag behind its slots.
         blended = self.phase.control == "open" and self.departure.kind == SHAPE
@@ -120,7 +120,7 @@ class Leg:
         return Motion(np.array([self.start, self.t_end]), pieces, np.eye(3))
 
     @cached_property
-    def paths(self) -> tuple[Reference, Motion]:
+    def slots_and_motion(self) -> tuple[Reference, Motion]:
         """Reference of the slots, and motion of the body, by which the agents are expected to fly.
 
         They are those of the leg if slots are tracked. Agents that distances alone lead turn the slots as they turn
@@ -161,13 +161,13 @@ class Leg:
         return float(time[beyond[-1]] - self.start) if len(beyond) else 0.0
 
     @cached_property
-    def after(self) -> PhaseState:
+    def planned_end_state(self) -> PhaseState:
         """The planned state at the end, if it is known."""
         return self.state_at(self.end)
 
     def state_at(self, t: float) -> PhaseState:
         """The planned state at a time [s]."""
-        reference, motion = self.paths
+        reference, motion = self.slots_and_motion
         r, v = slot_derivatives(reference, motion, np.array([t]), 2)[0]
         pose: Pose | None = pose_at(motion, t)
         frame = self.frame

@@ -64,13 +64,13 @@ def limits_of(
     limits, n = limits or mission.limits, mission.n_agents
     mass, up = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
 
-    def more(order: int, x: Floats, who: Ints) -> Floats | float:
+    def reserve_of_order(order: int, x: Floats, who: Ints) -> Floats | float:
         if reserve is None or order + 1 >= x.shape[1]:
             return 0.0  # the jerk that counts is that of the slots
         return reserve[who] * np.linalg.norm(x[:, order + 1], axis=-1).max(axis=0)
 
     def motion(q: Quantity, x: Floats, who: Ints) -> Floats:
-        return SIZES[q.way](x[:, q.order]) + more(q.order, x, who)
+        return SIZES[q.way](x[:, q.order]) + reserve_of_order(q.order, x, who)
 
     def force_per_mass(x: Floats, who: Ints) -> Floats:
         """What a thrust gives per mass [m/s^2], against drag if vehicles leave a reserve."""
@@ -78,11 +78,11 @@ def limits_of(
         return x[:, 2] + up - air
 
     def tilt(_: Quantity, x: Floats, who: Ints) -> Floats:
-        f, off = force_per_mass(x, who), more(2, x, who)
+        f, off = force_per_mass(x, who), reserve_of_order(2, x, who)
         return np.rad2deg(np.arctan2(SIZES["horizontal"](f) + off, f[..., 2] - off))
 
     def thrust(_: Quantity, x: Floats, who: Ints) -> Floats:
-        return mass[who] * (SIZES[""](force_per_mass(x, who)) + more(2, x, who))
+        return mass[who] * (SIZES[""](force_per_mass(x, who)) + reserve_of_order(2, x, who))
 
     ways, finite = {"tilt": tilt, "thrust": thrust}, []
     for q in (*MOTIONS, QUANTITIES["tilt"], QUANTITIES["thrust"]):
@@ -104,7 +104,7 @@ def use_of_limits(
     fine: bool = True,
 ) -> list[Reached]:
     """What a reference reaches of each limit between two times [s]; on the grid alone unless ``fine``."""
-    time = _grid(reference, motion, begin, end)
+    time = _grid_times(reference, motion, begin, end)
     n = len(reference.p0)
     step = max(1, _BLOCK // len(time))
     best: list[Reached | None] = [None] * len(limits)
@@ -121,7 +121,7 @@ def use_of_limits(
     return [highest for highest in best if highest is not None]
 
 
-def _grid(reference: Reference, motion: Motion, begin: float, end: float) -> Floats:
+def _grid_times(reference: Reference, motion: Motion, begin: float, end: float) -> Floats:
     knots = np.union1d(motion.knots, reference.knots)
     knots = knots[(knots >= begin) & (knots <= end)]
     each = max(2, min(_PIECE, _MOST // max(len(knots), 1)))

@@ -23,12 +23,12 @@ from rigidfleet.planning.abort import (
     SHORTEST,
     Aborts,
     gentle_limits,
-    least_time,
     phases_of,
+    shortest_time,
     state_to_leave,
 )
 from rigidfleet.planning.clearance import CLOSE, closest, speed_bounds
-from rigidfleet.planning.courses import height_above_landing, rises
+from rigidfleet.planning.courses import climb_heights, height_above_landing
 from rigidfleet.planning.legs import Leg, depart, leg_from, leg_of, phase_spans
 from rigidfleet.planning.limits import use_of_limits
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase
@@ -64,10 +64,10 @@ def legs_from(
     legs: list[Leg] = []
     for k, phase in enumerate(phases, start=number):
         leg = timed_leg(mission, phase, now, k)
-        if not leg.known:
+        if not leg.has_known_ways:
             break
         legs.append(leg)
-        now = leg.after
+        now = leg.planned_end_state
     return legs
 
 
@@ -84,8 +84,8 @@ def answer_to(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg
     legs = plan()
     abort = Aborts(mission, legs, now.lost).abort_at(now.t - mission.aborting.reaction)
     phases, least = phases_of(mission, abort.steps, "abort: "), abort.certificate.separation
-    promise = least if abort.way and math.isfinite(least) else None
-    return Answer(legs_from(mission, state_to_leave(legs, now), phases), abort.reason, promise)
+    promise = least if abort.way_text and math.isfinite(least) else None
+    return Answer(legs_from(mission, state_to_leave(legs, now), phases), abort.why_no_way, promise)
 
 
 def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg]]) -> list[Leg]:
@@ -95,25 +95,25 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
     rest = 0.0 if now.blend is None else now.blend.t0 + now.blend.T_b - now.t
     legs: list[Leg] = []
 
-    def then(make: Callable[[float], Phase], *, freely: bool = False) -> bool:
+    def add_leg(make: Callable[[float], Phase], *, freely: bool = False) -> bool:
         """Add the leg of a phase; with ``freely``, only if it leads into nothing. Return whether it was added."""
         nonlocal now
         leg = _shortest_leg(mission, now, make, SHORTEST)
-        if freely and _hits(mission, leg):
+        if freely and _hits_obstacle(mission, leg):
             return False
         legs.append(leg)
-        now = leg.after
+        now = leg.planned_end_state
         return True
 
     start = now
-    then(lambda t: Brake(kind="brake", name="brake (loss)", duration=max(t, rest), travel=t))
+    add_leg(lambda t: Brake(kind="brake", name="brake (loss)", duration=max(t, rest), travel=t))
     # Slots on ways of their own are where they should be only with the body's way.
-    if (start.blend is not None and start.formation is None) or _hits(mission, legs[0]):
+    if (start.blend is not None and start.formation is None) or _hits_obstacle(mission, legs[0]):
         whole = plan()
         slow, *_ = Aborts(mission, whole, start.lost).slow_down(start.t)
         brake = phases_of(mission, [slow._replace(name="brake (loss)")])
         legs = legs_from(mission, state_to_leave(whole, start), brake)
-        now = legs[-1].after
+        now = legs[-1].planned_end_state
     if d.on_loss == "hold":
         until = phase_spans(mission)[-1][1] if d.hold_until is None else d.hold_until
         if until > now.t:
@@ -123,17 +123,17 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
     shaped = now.formation is not None
     if name is not None and name != now.formation:
         spread = partial(Reshape, kind="reshape", name="spread (loss)", formation=name)
-        shaped = then(lambda t: spread(blend=t, duration=t), freely=True)
+        shaped = add_leg(lambda t: spread(blend=t, duration=t), freely=True)
     assert now.goal is not None
     axes = now.goal.T.T
     if shaped and math.acos(min(1.0, float(axes[2, 2]))) > _LEVEL:
         yaw = math.degrees(math.atan2(axes[1, 0] - axes[0, 1], axes[0, 0] + axes[1, 1]))
         level = partial(Turn, kind="turn", name="level (loss)", roll_deg=0.0, pitch_deg=0.0)
-        shaped = then(lambda t: level(yaw_deg=yaw, duration=t), freely=True)
+        shaped = add_leg(lambda t: level(yaw_deg=yaw, duration=t), freely=True)
     everyone = tuple(range(1, mission.n_agents + 1))
     land = partial(Land, kind="land", name="land (loss)")
     each = partial(land, agents=everyone)
-    ways = [(each, -float(rises(mission, each(duration=1.0), now).min()))]
+    ways = [(each, -float(climb_heights(mission, each(duration=1.0), now).min()))]
     if shaped:  # together, unless something is below some
         ways.insert(0, (land, height_above_landing(mission, now)))
     for make, depth in ways:
@@ -142,12 +142,12 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
         least = max(_PEAK_SPEED * depth / DESCENT, SHORTEST)
         least = max(math.sqrt(_PEAK_ACCELERATION * depth / _DESCENDING), least)
         down = _shortest_leg(mission, now, lambda t, make=make: make(duration=t), least)
-        if not _hits(mission, down):
+        if not _hits_obstacle(mission, down):
             break
     return [*legs, down]
 
 
-def _hits(mission: Mission, leg: Leg) -> bool:
+def _hits_obstacle(mission: Mission, leg: Leg) -> bool:
     """Whether a leg leads a slot into an obstacle or the ground."""
     planned = planned_phase(leg, FEWEST_SAMPLES)
     near = (closest(planned, x, leg.radius, speed_bounds(planned)) for x in mission.obstacles)
@@ -170,5 +170,5 @@ def _shortest_leg(
         return np.array([x.share for x in use])
 
     allowed = np.maximum(shares(least, now.t + 1e-9 * max(1.0, now.t)), 1.0)
-    time, _ = least_time(least, lambda time: shares(time) / allowed, _KEPT)
+    time, _ = shortest_time(least, lambda time: shares(time) / allowed, _KEPT)
     return leg_from(mission, make(time), departure)

@@ -47,7 +47,7 @@ from rigidfleet.planning import solvers
 from rigidfleet.planning.body_trajectories import points_passed
 from rigidfleet.planning.certificate import Certificate
 from rigidfleet.planning.courses import regulators
-from rigidfleet.planning.disturbances import with_fixed_agents, without
+from rigidfleet.planning.disturbances import drop_lost, with_fixed_agents
 from rigidfleet.planning.legs import Leg
 from rigidfleet.planning.reference import PhaseState, Pose, copy_as, copy_with, pose_at
 from rigidfleet.planning.tolerances import (
@@ -94,12 +94,12 @@ class PhasePlan(Leg):
         return super().certificate if len(self.radius) <= bounds.ALL_PAIRS else None
 
     @property
-    def large(self) -> bool:
+    def is_large(self) -> bool:
         """Whether a method for large formations solves for the multipliers."""
         return self.method != "dense"
 
     @property
-    def target(self) -> dict[str, Any] | None:
+    def target_record(self) -> dict[str, Any] | None:
         """What the phase is to reach, or the attitude of a formation established, for the record."""
         goal, meets, lies = self.goal, self.phase.meets, self.lies
         if goal is None or not (meets or lies):
@@ -160,17 +160,17 @@ class PhasePlan(Leg):
         size += 0 if self.frame is None else 10 if self.problem.body_formulation else 4
         velocity = self.velocity_tolerance()
         return absolute_tolerances(
-            self.integrator, size, velocity, self.distances, large=self.large
+            self.integrator, size, velocity, self.distances, large=self.is_large
         )
 
     def velocity_tolerance(self) -> Floats:
         """Absolute tolerance (N,) of velocities [m/s]."""
         beta = self.problem.law.beta
         return tolerance_of_velocity(
-            self.integrator, self.before.r, self.masses, beta, large=self.large
+            self.integrator, self.before.r, self.masses, beta, large=self.is_large
         )
 
-    def residual(self) -> tuple[float, float]:
+    def residual_tolerances(self) -> tuple[float, float]:
         """Relative and absolute [m/s^2] residual of an iterative solve for the multipliers."""
         share = min(max(_RESIDUAL * self.integrator.rtol, _LEAST_RESIDUAL), _MOST_RESIDUAL)
         return share, _FLOOR * float(self.velocity_tolerance().min())  # over a step of 1 s
@@ -184,7 +184,7 @@ class PhasePlan(Leg):
         self.edges, self.distances = self.edges[kept], self.distances[kept]
         self.__dict__.pop("tolerances", None)
         self.method = solvers.choose_method(len(lost), self.edges, self.constraint.solver)
-        self.problem = without(self.problem, kept, lost, self.damping(lost), large=self.large)
+        self.problem = drop_lost(self.problem, kept, lost, self.damping(lost), large=self.is_large)
         return kept
 
     def state_at_end(self, t: float, y: Floats, w: Workspace) -> PhaseState:
@@ -227,7 +227,7 @@ def plan_phase(
     masses = mission.fleet.mass.copy()
     edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
     method = solvers.choose_method(len(masses), edges, mission.constraint.solver)
-    _refuse(mission, phase, leg.start, edges if method == "dense" else edges[:0])
+    _refuse_hopeless_phase(mission, phase, leg.start, edges if method == "dense" else edges[:0])
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if shaping is None:
         d1 = now.reference.values_of(edges, d1)
@@ -251,8 +251,8 @@ def plan_phase(
             masses, 1.0 / masses, float(masses.sum()), float(masses.mean()), mission.fleet.thrust_limit.copy(),
             mission.agents.saturate, mission.gravity,
         ),
-        graph=_graph(edges.tobytes(), masses.tobytes(), large=method != "dense"),
-        law=_law(
+        graph=_constraint_graph(edges.tobytes(), masses.tobytes(), large=method != "dense"),
+        law=_constraint_law(
             mission,
             mission.damping(held, now.lost),
             damped=phase.control != "tracking" and len(edges) > 0,
@@ -260,7 +260,7 @@ def plan_phase(
         reference=reference,
         motion=motion,
         feedback=feedback,
-        control=_control(mission, phase, masses),
+        control=_control_of_phase(mission, phase, masses),
         disturbance=no_disturbance(masses) if disturbance is None else disturbance,
         external=_limit_steps(external or External(), motion, reference),
     )  # fmt: skip
@@ -300,7 +300,7 @@ def _limit_steps(external: External, motion: Motion, reference: Reference) -> Ex
     return external if longest == most else external._replace(max_step=0.5 * longest)
 
 
-def _refuse(mission: Mission, phase: Phase, start: float, edges: Ints) -> None:
+def _refuse_hopeless_phase(mission: Mission, phase: Phase, start: float, edges: Ints) -> None:
     """Refuse a phase that is to end before it starts [s], or that would take hours to simulate, for its dense edges."""
     if phase.until is not None and phase.until <= start:
         raise StoppedError(
@@ -319,7 +319,7 @@ def _refuse(mission: Mission, phase: Phase, start: float, edges: Ints) -> None:
 
 
 @lru_cache(64)
-def _graph(edges: bytes, masses: bytes, *, large: bool) -> Graph:
+def _constraint_graph(edges: bytes, masses: bytes, *, large: bool) -> Graph:
     """The constraint graph, cached because most phases have the same one as the phase before."""
     pairs = np.frombuffer(edges, dtype=np.int64).reshape(-1, 2).copy()
     return graph(pairs, np.frombuffer(masses), large=large)
@@ -345,7 +345,7 @@ def _agree(lengths: Floats, slots: Floats, edges: Ints) -> bool:
     return bool((np.abs(lengths - own) <= _ROUNDED + 1e-12 * own).all())
 
 
-def _law(mission: Mission, mu: float, *, damped: bool) -> ConstraintLaw:
+def _constraint_law(mission: Mission, mu: float, *, damped: bool) -> ConstraintLaw:
     c = mission.constraint
     pid = c.stabilisation == "pid"
     return ConstraintLaw(
@@ -361,7 +361,7 @@ def _law(mission: Mission, mu: float, *, damped: bool) -> ConstraintLaw:
     )
 
 
-def _control(mission: Mission, phase: Phase, masses: Floats) -> Control:
+def _control_of_phase(mission: Mission, phase: Phase, masses: Floats) -> Control:
     kind = {"open": OPEN, "tracking": TRACKING, "body": BODY}[phase.control]
     force = np.tile(np.array(phase.input_force, dtype=float), (len(masses), 1))
     force[:, 2] += masses * mission.gravity
@@ -387,7 +387,7 @@ def _feedback(mission: Mission, phase: Phase, goal: Pose, t0: float, arrival: fl
         horizon = arrival - t0
         to_go = np.concatenate([[0.0], np.geomspace(min(1e-6, 1e-3 * horizon), horizon, 1000)])
         laws = regulators(mission, phase)
-        tables = [_gains(law, to_go) for law in (laws, laws.attitude)]
+        tables = [_regulator_gains(law, to_go) for law in (laws, laws.attitude)]
         gain, slope = (np.concatenate(columns, axis=1) for columns in zip(*tables, strict=True))
     return Feedback(
         to_go, np.ascontiguousarray(gain), np.ascontiguousarray(slope), arrival, goal.r, goal.v,
@@ -395,7 +395,7 @@ def _feedback(mission: Mission, phase: Phase, goal: Pose, t0: float, arrival: fl
     )  # fmt: skip
 
 
-def _gains(law: Regulator, to_go: Floats) -> tuple[Floats, Floats]:
+def _regulator_gains(law: Regulator, to_go: Floats) -> tuple[Floats, Floats]:
     """Gains (K, 2) of one axis over the time to go (K,) [s], and their slopes (Riccati equation)."""
     if law.horizon == "infinite":
         gain = np.tile(lqr.double_integrator_gains(law.Q, law.R), (len(to_go), 1))

@@ -61,7 +61,7 @@ class PlannedPhase:
         return self.leg.certificate
 
 
-def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPhase], bool]:
+def preview_phases(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPhase], bool]:
     """One `PlannedPhase` for each phase, or for the first ``phases``, and whether the plan is known to its end."""
     planned: list[PlannedPhase] = []
     most = samples_per_phase(mission)
@@ -72,23 +72,23 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
     now = state_at_start(mission)
     for phase in wanted[:possible]:
         leg = leg_of(mission, phase, now)
-        if not leg.known:
+        if not leg.has_known_ways:
             return planned, False
-        now = leg.after
+        now = leg.planned_end_state
         planned.append(planned_phase(leg, most))
     return planned, len(planned) == len(wanted)
 
 
 def planned_phase(leg: Leg, most: int) -> PlannedPhase:
     """At most ``most`` samples of a leg."""
-    reference, motion = leg.paths
+    reference, motion = leg.slots_and_motion
     count = min(max(_SAMPLES, int((leg.end - leg.start) / _STEP) + 1), _MOST, most)
     time = np.linspace(leg.start, leg.end, count)
     states = slot_derivatives(reference, motion, time, 3).swapaxes(0, 1)
     straight = leg.phase.shaping is not None and not len(reference.knots)
     ways = (reference.p0, reference.p0 + reference.dp) if straight else None
     shapes = leg.before.formation, leg.formation
-    return PlannedPhase(leg.phase.name, time, *states, leg.exact, leg, ways, shapes)
+    return PlannedPhase(leg.phase.name, time, *states, leg.follows_exactly, leg, ways, shapes)
 
 
 def samples_per_phase(mission: Mission) -> int:

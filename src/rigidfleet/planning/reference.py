@@ -29,7 +29,7 @@ class ByEdge:
 
     def values_of(self, edges: Ints, other: Floats | float) -> Floats:
         """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges, or (B, m), then of so many flights."""
-        keys, own = _keys(edges), _keys(self.edges)
+        keys, own = _edge_codes(edges), _edge_codes(self.edges)
         order = np.argsort(own)
         at = np.append(order, len(order))[np.searchsorted(own, keys, sorter=order)]
         known = np.append(own, -1)[at] == keys
@@ -38,11 +38,11 @@ class ByEdge:
     def with_values(self, edges: Ints, values: Floats) -> ByEdge:
         """These values, updated with the ``values`` of edges (m, 2), i < j."""
         edges = np.concatenate([edges, self.edges])
-        first = np.unique(_keys(edges), return_index=True)[1]
+        first = np.unique(_edge_codes(edges), return_index=True)[1]
         return ByEdge(edges[first], np.concatenate([values, self.values])[first])
 
 
-def _keys(edges: Ints) -> Ints:
+def _edge_codes(edges: Ints) -> Ints:
     return (edges[:, 0] << 32) + edges[:, 1]
 
 
@@ -92,7 +92,7 @@ def pose_at(motion: Motion, t: float) -> Pose:
     """The pose of a reference motion at a time [s], with its acceleration and jerk."""
     cm, axes = (x[..., 0] for x in body_series(motion, np.array([t])))
     r, v, a, jerk = series.derivatives(cm)[:4]
-    omega, alpha, alpha_dot = series.derivatives(series.body_rates(axes))[:3]
+    omega, alpha, alpha_dot = series.derivatives(series.body_rates_series(axes))[:3]
     return Pose(r, v, axes[0].T, omega, a=a, jerk=jerk, alpha=alpha, alpha_dot=alpha_dot)
 
 

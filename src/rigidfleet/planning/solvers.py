@@ -52,11 +52,11 @@ def elimination_steps(n: int, edges: Ints) -> Ints | None:
     """
     if n < 3 or len(edges) != 3 * n - 6:
         return None
-    return _steps(n, np.ascontiguousarray(edges, dtype=np.int64).tobytes())
+    return _cached_elimination_steps(n, np.ascontiguousarray(edges, dtype=np.int64).tobytes())
 
 
 @lru_cache(maxsize=4)
-def _steps(n: int, data: bytes) -> Ints | None:
+def _cached_elimination_steps(n: int, data: bytes) -> Ints | None:
     edges = np.frombuffer(data, dtype=np.int64).reshape(-1, 2)
     later = edges.max(axis=1)
     if (np.bincount(later, minlength=n) == np.minimum(np.arange(n), 3)).all():
@@ -96,7 +96,7 @@ def _steps(n: int, data: bytes) -> Ints | None:
     return steps if at == 0 else None
 
 
-def dissection(points: Floats, edges: Ints, leaf: int = 16) -> Ints:
+def dissection_order(points: Floats, edges: Ints, leaf: int = 16) -> Ints:
     """Order (N,) to eliminate agents in: geometric nested dissection (George, 1973) of points (N, 3).
 
     Recursively: both halves across the longest extent, then the agents that separate them. Parts of ``leaf`` or fewer

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from rigidfleet._common.progress import report
+from rigidfleet._common.progress import report_step
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.findings import Keys
 from rigidfleet.mission.values import AUTO
@@ -88,19 +88,19 @@ def complete_times(mission: Mission) -> Mission:
     tables = mission.to_dict()["phases"]
     now = state_at_start(mission)
     for k, phase in enumerate(mission.phases[: last + 1]):
-        report(f"timing '{phase.name}'")
+        report_step(f"timing '{phase.name}'")
         leg = timed_leg(mission, phase, now, k)
         if leg.phase is not phase:
             changed = leg.phase.model_dump(mode="json", include={*phase.automatic, "through"})
             tables[k] = tables[k] | {key: x for key, x in changed.items() if x or key != "through"}
-        if not leg.known:
+        if not leg.has_known_ways:
             problem = "depends on distances alone, so that the starts of later phases are known only in flight"
             name = None if phase.shaping is None else phase.shaping.formation
             remedy = (
                 f"give the formation a shape or slots, or give '{mission.phases[last].name}' a time"
             )
             raise ways.error_of_key(mission, k, "formation", name, problem, remedy)
-        now = leg.after
+        now = leg.planned_end_state
     return mission.with_phases(tables)
 
 
@@ -182,13 +182,13 @@ def _least(
             return fastest
     limits = limits_of(mission) if limits is None else limits
 
-    def each(time: float, *, fine: bool = False) -> list[Reached]:
+    def reached_at(time: float, *, fine: bool = False) -> list[Reached]:
         leg = leg_from(mission, vary(time), departure)
         return use_of_limits(limits, leg.reference, leg.motion, leg.start, leg.end, fine=fine)
 
     def excess(time: float) -> float:
         """Greatest share of a limit [-], as a power that falls in proportion to the time of ways from rest to rest."""
-        return max(x.share ** (1 / x.limit.of.order) for x in each(time))
+        return max(x.share ** (1 / x.limit.of.order) for x in reached_at(time))
 
     # At rest at both ends, every share falls with a power of the time: from a trial, the first guess is the solution.
     low, high, time = 0.0, math.inf, max(_TRIAL, shortest)
@@ -205,8 +205,8 @@ def _least(
         guess = time * min(max(over * _NEARLY, 1 / _STEP), _STEP)
         time = max(min(max(guess, low * _NEAR), high / _NEAR), shortest)
     if high == math.inf:
-        return None, max(each(low), key=lambda x: x.share)
-    while (worst := max(each(high, fine=True), key=lambda x: x.share)).share > 1.0 + SLACK:
+        return None, max(reached_at(low), key=lambda x: x.share)
+    while (worst := max(reached_at(high, fine=True), key=lambda x: x.share)).share > 1.0 + SLACK:
         high *= 1.001  # between the samples of the grid
     return high, worst
 

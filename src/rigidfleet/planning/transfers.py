@@ -67,7 +67,7 @@ def least_duration(
     return float(np.maximum(fast, 0.0).max())
 
 
-def transfer(
+def plan_transfer(
     start: ArrayLike,
     goal: ArrayLike,
     *,
@@ -113,7 +113,7 @@ def transfer(
     least_time = max(least_duration(s, g, limits.speed, limits.acceleration), _SHORTEST)
     for duration in (slower * least_time for slower in _SLOWER):
         for start_number in range(_STARTS + 2):
-            control = _straight(s, g)
+            control = _straight_controls(s, g)
             if start_number > _STARTS:  # as in a roundabout, for crowds that all meet at one place
                 control = _improve(_ways_to_the_right(s, g), duration, limits, rng)
             elif start_number:  # straight ways will not do
@@ -138,7 +138,7 @@ class _Limits(NamedTuple):
     metric: Floats
 
 
-def _basis(u: Floats, spans: int) -> Floats:
+def _b_spline_weights(u: Floats, spans: int) -> Floats:
     """Weights (K, M + 3) of the control points at parameters u (K,) in [0, M]."""
     k = np.minimum(u.astype(np.int64), spans - 1)
     x = u - k
@@ -147,7 +147,7 @@ def _basis(u: Floats, spans: int) -> Floats:
     return B
 
 
-def _straight(s: Floats, g: Floats) -> Floats:
+def _straight_controls(s: Floats, g: Floats) -> Floats:
     """Control points (M + 3, N, 3) of straight ways. The first and last three are equal, for rest at the ends."""
     share = np.clip((np.arange(_SPANS + 3) - 2) / (_SPANS - 2), 0.0, 1.0)[:, None, None]
     return (1 - share) * s + share * g
@@ -172,7 +172,7 @@ def _improve(control: Floats, duration: float, limits: _Limits, rng: np.random.G
     control = control.copy()
     longest = float(np.linalg.norm(control[-1] - control[0], axis=1).max())
     each = max(_SAMPLES, math.ceil(_PASSED * longest / (_SPANS * limits.distance)))
-    B = _basis(np.linspace(0.0, _SPANS, _SPANS * each + 1), _SPANS)
+    B = _b_spline_weights(np.linspace(0.0, _SPANS, _SPANS * each + 1), _SPANS)
     free = slice(3, _SPANS)
     share = np.linspace(0.0, 1.0, _SPANS - 1)[1:-1, None, None]
     noise = rng.uniform(-1, 1, (1, n, 3)) * (_NOISE * limits.distance / limits.metric)

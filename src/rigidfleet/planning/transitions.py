@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.progress import report
+from rigidfleet._common.progress import report_step
 from rigidfleet.formation.assignment import closest_approach
 from rigidfleet.math import rigid_body
 from rigidfleet.mission import Mission
@@ -25,7 +25,7 @@ from rigidfleet.mission.values import AUTO
 from rigidfleet.planning.abort import Aborts, Step, first_free_level, neighbours_on_ways, phases_of
 from rigidfleet.planning.legs import state_at_start
 from rigidfleet.planning.reference import PhaseState
-from rigidfleet.planning.transfers import transfer
+from rigidfleet.planning.transfers import plan_transfer
 from rigidfleet.planning.ways import Timed, error_of_key
 from rigidfleet.typing import Floats
 
@@ -66,9 +66,9 @@ def expand_phases(mission: Mission, timed: Timed) -> Mission:
             so_far = data | {"phases": tables, "formations": data["formations"] | forms}
             state = partial(_state_after, mission, so_far, timed)
             if isinstance(phase, Vertical):
-                parts = _stagger(mission, k, table, phase, before, state)
+                parts = _expand_stagger(mission, k, table, phase, before, state)
             elif isinstance(phase, Reshape):
-                parts, levels = _transition(mission, k, table, phase, before, state)
+                parts, levels = _expand_transition(mission, k, table, phase, before, state)
                 forms |= levels
         tables += parts
         before = before if phase.shaping is None else phase.shaping.formation
@@ -80,7 +80,7 @@ def expand_phases(mission: Mission, timed: Timed) -> Mission:
 _State = Callable[[], PhaseState | None]
 
 
-def _transition(
+def _expand_transition(
     mission: Mission, number: int, table: dict[str, Any], phase: Reshape, before: str | None, state: _State
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:  # fmt: skip
     """The phase with its bent ways, or the phases of a transition by layers; as it is if straight ways will do.
@@ -88,17 +88,19 @@ def _transition(
     Beside the tables of the phases, the formations that they take on the way.
     """
     if phase.transition == "ways":
-        report(f"looking for ways of the agents in '{phase.name}'")
-        return [_with_ways(mission, number, table, phase, before, _box(mission, state()))], {}
+        report_step(f"looking for ways of the agents in '{phase.name}'")
+        return [
+            _add_bent_ways(mission, number, table, phase, before, _airspace(mission, state()))
+        ], {}
     stops = _layer_slots(mission, number, phase, before)
     if stops is None:
         return [table], {}
     names = [f"{phase.name}: {part}" for part in _PARTS[:2]]
     levels = {name: {"slots": x, "edges": []} for name, x in zip(names, stops[1:3], strict=True)}
-    return _phases(table, phase, names, stops), levels
+    return _layer_phases(table, phase, names, stops), levels
 
 
-def _stagger(
+def _expand_stagger(
     mission: Mission, number: int, table: dict[str, Any], phase: Vertical, before: str | None, state: _State
 ) -> list[dict[str, Any]]:  # fmt: skip
     """The phases of a staggered take-off or landing, one for each group, or of a landing on the own places.
@@ -109,7 +111,7 @@ def _stagger(
         The duration leaves no time for the last group, or so much that groups would be under way together.
     """
     if phase.stagger is None:
-        return _to_own_places(mission, number, table, phase, state())
+        return _phases_to_own_places(mission, number, table, phase, state())
     assert isinstance(phase.duration, float)  # checked
     moving = phase.agents or tuple(range(1, mission.n_agents + 1))
     groups = [[i] for i in moving]
@@ -136,7 +138,7 @@ def _stagger(
     ]
 
 
-def _to_own_places(
+def _phases_to_own_places(
     mission: Mission, number: int, table: dict[str, Any], phase: Vertical, now: PhaseState | None
 ) -> list[dict[str, Any]]:
     """The phases in which each vehicle flies to where it stood at the start, and lands (`planning.abort`).
@@ -175,13 +177,13 @@ def _state_after(mission: Mission, so_far: dict[str, Any], timed: Timed) -> Phas
         mission = mission.rewritten(so_far)
     for number, phase in enumerate(mission.phases[: len(tables)]):
         leg = None if phase.replaced else timed(mission, phase, now, number)
-        if leg is None or not leg.known:
+        if leg is None or not leg.has_known_ways:
             return None
-        now = leg.after
+        now = leg.planned_end_state
     return now
 
 
-def _box(mission: Mission, now: PhaseState | None) -> Floats:
+def _airspace(mission: Mission, now: PhaseState | None) -> Floats:
     """Corners (2, 3) [m], about the centre of mass in body axes, between which vehicles fly from a state on.
 
     These are heights above the ground and within the geofence if the formation is level then, and the geofence's sides
@@ -205,7 +207,7 @@ def _box(mission: Mission, now: PhaseState | None) -> Floats:
     return box
 
 
-def _with_ways(
+def _add_bent_ways(
     mission: Mission,
     number: int,
     table: dict[str, Any],
@@ -239,7 +241,7 @@ def _with_ways(
     highest = np.minimum(high + room, np.maximum(within[1], high))
     each = 1.0 / np.sqrt(3.0)  # limits of each axis, which together keep those of the vector
     try:
-        ways = transfer(
+        ways = plan_transfer(
             p, q, distance=distance, speed=each * limits.speed, acceleration=each * limits.acceleration,
             box=(lowest, highest), downwash=below / distance,
         )  # fmt: skip
@@ -301,7 +303,7 @@ def _layer_slots(
             return None
     apart = 2.0 * float(radius.max()) + limit + limits.separation_allowance
     height = max(apart, 2.0 * float(radius.max()) + (limits.separation_below or 0.0))
-    level = height * _level_of(neighbours_on_ways(apart, p, q))
+    level = height * _levels_of_agents(neighbours_on_ways(apart, p, q))
     one, two = (np.column_stack([x[:, :2], level]) for x in (p, q))
     stops = [p, one, two, q]
     for (a, b), part in zip(pairwise(stops), _PARTS, strict=True):
@@ -317,7 +319,7 @@ def _layer_slots(
     return stops
 
 
-def _level_of(near: list[list[int]]) -> Floats:
+def _levels_of_agents(near: list[list[int]]) -> Floats:
     """Level (N,) of each agent, ... -1, 0, 1, ..., such that no two that are near each other are within a level."""
     colour = np.full(len(near), -1)
     for i in np.argsort([-len(others) for others in near], kind="stable").tolist():
@@ -329,7 +331,7 @@ def _level_of(near: list[list[int]]) -> Floats:
     return place[colour]
 
 
-def _phases(
+def _layer_phases(
     table: dict[str, Any], phase: Reshape, names: list[str], stops: list[Floats]
 ) -> list[dict[str, Any]]:
     """The three phases; a blend is shared such that all have about the same peak acceleration."""

@@ -17,7 +17,7 @@ from rigidfleet.kernel.clock_records import FASTEST, OFF, RATE, VehicleClocks, s
 from rigidfleet.kernel.mail import Links, no_network
 from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
 from rigidfleet.math import series
-from rigidfleet.math.margins import Lag, LoopGains, overshoot
+from rigidfleet.math.margins import Lag, LoopGains, overshoot_time
 from rigidfleet.math.quadrotor import ROTORS
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import VehicleModel
@@ -28,10 +28,10 @@ from rigidfleet.planning.derivatives import (
     slot_derivatives,
     slot_series,
     yaw_along,
+    yaw_by_kind,
     yaw_derivatives,
-    yaw_of,
 )
-from rigidfleet.planning.disturbances import disturbance
+from rigidfleet.planning.disturbances import mission_disturbance
 from rigidfleet.planning.virtual_clock import delay_by
 from rigidfleet.typing import Floats, Ints
 
@@ -67,7 +67,7 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
     longest = min(autopilot.step, _FORCED if max_step < math.inf else math.inf, max_step / 10.0)
     steps = max(1, math.ceil(1.0 / autopilot.rate / longest - 1e-9))
     flight = fleet.ideal_flight(
-        fleet.quadrotors(made, mission.gravity),
+        fleet.quadrotor_arrays(made, mission.gravity),
         start=0.0,
         h=1.0 / (autopilot.rate * steps),
         steps=steps,
@@ -77,7 +77,7 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
         np.full(n, float(mission.tracking.drag_feedforward)),
         np.full((n, 3), mission.tracking.integral),
     )
-    around = disturbance(mission)
+    around = mission_disturbance(mission)
     same = ("wind", "gust_step", "gust", "floor", "radius", "roofs")
     air = flight.air._replace(
         **{name: getattr(around, name) for name in same},
@@ -87,7 +87,7 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
         ground=mission.ground,
     )
     return flight._replace(
-        air=air, guidance=guidance, sensing=_sensing(mission), network=network_of(mission),
+        air=air, guidance=guidance, sensing=_sensing_in_ticks(mission), network=network_of(mission),
         clocks=clocks_of(mission),
     )  # fmt: skip
 
@@ -125,7 +125,7 @@ def lag_times(mission: Mission) -> Floats:
         if not model.point:
             left = _LEFT * max(model.linear_drag)
             drag = left if tracking.drag_feedforward else model.linear_drag[0]
-            times[i] = overshoot(lags[i], law, drag / model.mass)
+            times[i] = overshoot_time(lags[i], law, drag / model.mass)
     return times
 
 
@@ -182,7 +182,7 @@ def kernel_vehicle(model: VehicleModel, mass: float) -> fleet.VehicleDynamics:
     )
 
 
-def _sensing(mission: Mission) -> fleet.Sensing:
+def _sensing_in_ticks(mission: Mission) -> fleet.Sensing:
     """Rate and delay of measurements, in whole ticks of the attitude control."""
     n, rate, d = mission.n_agents, mission.autopilot.rate, mission.disturbances
     noise = None if d is None else d.noise
@@ -254,14 +254,14 @@ def clocks_of(mission: Mission) -> VehicleClocks:
     if clocks is None:
         return made
 
-    def of_each(value: float | tuple[float, ...], kind: int, least: float) -> Floats:
+    def values_by_vehicle(value: float | tuple[float, ...], kind: int, least: float) -> Floats:
         if isinstance(value, tuple):
             return np.array(value, dtype=np.float64)
         return value * np.random.default_rng((kind, net.seed)).uniform(least, 1.0, n)
 
     return made._replace(
-        late=(of_each(clocks.late, _LATE, 0.0) * rate).round().astype(np.int64),
-        drift=1e-6 * of_each(clocks.drift, _DRIFT, -1.0),
+        late=(values_by_vehicle(clocks.late, _LATE, 0.0) * rate).round().astype(np.int64),
+        drift=1e-6 * values_by_vehicle(clocks.drift, _DRIFT, -1.0),
         gain=clocks.consensus,
         wait=math.inf if clocks.wait is None else clocks.wait,
     )
@@ -293,7 +293,7 @@ class TickTables:
         ``tau`` says how they stand (`kernel.clock_records`).
         """
         k = tick - tables.first
-        before = tables.path[k] if 0 <= k < len(tables.path) else self._path_at(tick, tau)
+        before = tables.path[k] if 0 <= k < len(tables.path) else self._path_by_clocks(tick, tau)
         if problem.control.kind == TRACKING:
             self._source = problem
         else:
@@ -305,7 +305,7 @@ class TickTables:
         if self._source is not None:
             self._source = delay_by(self._source, late)
 
-    def _path_at(self, tick: int, tau: Floats | None) -> Floats:
+    def _path_by_clocks(self, tick: int, tau: Floats | None) -> Floats:
         """The path (N, 6) at a tick, of each vehicle by its own clock, if it has one."""
         if tau is None:
             return self._path(np.array([tick]))[0]
@@ -361,7 +361,7 @@ class TickTables:
         # Rows of single ticks are taken in flight from those of all
         parts = [x if len(x) else np.zeros((len(ticks), *x.shape[1:])) for x in made[2:6]]
         path, yaw, jerk, snap = (np.zeros((last - first, *x.shape[1:])) for x in parts)
-        path[0] = self._path_at(first, tau) if self.compensated else 0.0
+        path[0] = self._path_by_clocks(first, tau) if self.compensated else 0.0
         return made._replace(
             path=path, yaw=yaw, jerk=jerk, snap=snap, by_clock=np.concatenate(parts, axis=2), origin=origin,
         )  # fmt: skip
@@ -418,7 +418,7 @@ def commanded_yaw(mission: Mission) -> Yaw:
     return Yaw(yaw.kind, math.radians(yaw.yaw_deg), yaw.point or (0.0, 0.0, 0.0))
 
 
-def first_yaw(mission: Mission) -> Floats:
+def initial_yaw(mission: Mission) -> Floats:
     """Yaw and its rate (2, N) [rad, rad/s] with which vehicles start."""
     start, frame = np.zeros((2, mission.n_agents)), mission.body_frame
     start[0] = 0.0 if frame is None else math.radians(frame.yaw_deg)
@@ -433,7 +433,7 @@ class YawTurn(NamedTuple):
     off: Floats  # (2, N) what these differ by from those asked for
 
 
-def turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> YawTurn:
+def yaw_turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> YawTurn:
     """The turn of vehicles with yaws and rates ``start`` (2, N) at a time [s] of a problem, at which its motion begins.
 
     Where no slots are tracked, they keep their yaw.
@@ -445,7 +445,7 @@ def turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> YawTurn:
 
 
 def turn_along(reference: Reference, motion: Motion, t: float, yaw: Yaw, start: Floats) -> YawTurn:
-    """`turn_from` while slots are tracked."""
+    """`yaw_turn_from` while slots are tracked."""
     if yaw.kind == "along":
         return YawTurn(t, start, np.zeros_like(start))
     off = start - yaw_derivatives(reference, motion, np.array([t]), yaw)[0, :2]
@@ -467,7 +467,7 @@ def slots_and_yaw(
     slots = slot_series(reference, body, time)
     if yaw.kind == "along":
         return slots, *yaw_along(reference, motion, time, slots, turn.start[0])
-    turned = yaw_of(body, slots, yaw)
+    turned = yaw_by_kind(body, slots, yaw)
     turned[0] += turn.off[0, :, None]
     done = blend_series(time, turn.begun, _TURN_TIME)[:3]
     if yaw.kind != "formation":
@@ -489,13 +489,13 @@ def _random_rows(kind: int, seed: int, rows: range, shape: tuple[int, ...]) -> F
     if not rows:
         return np.zeros((0, *shape))
     blocks = range(rows[0] // _BLOCK, rows[-1] // _BLOCK + 1)
-    numbers = np.concatenate([_block(kind, seed, block, shape) for block in blocks])
+    numbers = np.concatenate([_random_block(kind, seed, block, shape) for block in blocks])
     begin = rows[0] - blocks[0] * _BLOCK
     return numbers[begin : begin + len(rows)]
 
 
 @lru_cache(maxsize=8)
-def _block(kind: int, seed: int, block: int, shape: tuple[int, ...]) -> Floats:
+def _random_block(kind: int, seed: int, block: int, shape: tuple[int, ...]) -> Floats:
     random = np.random.default_rng((kind, seed, block))
     size = (_BLOCK, *shape)
     return random.standard_normal(size) if kind == _NOISE else random.random(size)

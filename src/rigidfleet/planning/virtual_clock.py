@@ -50,7 +50,7 @@ class VirtualClock:
         """Whether it runs as real time does."""
         return self.target == 1.0 and self.rate == (1.0, 0.0, 0.0)
 
-    def aim(self, target: float, omega: float) -> None:
+    def set_aim(self, target: float, omega: float) -> None:
         """Set the target, and while the clock is steady also the bandwidth omega [1/s]."""
         if self.is_steady:
             self.rate = self.target, 0.0, 0.0

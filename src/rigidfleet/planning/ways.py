@@ -15,7 +15,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from rigidfleet._common.progress import report
+from rigidfleet._common.progress import report_step
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -28,7 +28,7 @@ from rigidfleet.planning.lattice import FreeSpace, Layer, Roadmap, Way, constant
 from rigidfleet.planning.legs import Leg, latest_end, state_at_start
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
 from rigidfleet.planning.reference import PhaseState
-from rigidfleet.solids.records import corners, extent
+from rigidfleet.solids.records import box_corners, swept_extent
 from rigidfleet.typing import Floats
 
 #: The leg of a phase with its automatic times known, from the mission, the phase, the state at its start, its number.
@@ -62,10 +62,10 @@ def find_ways(mission: Mission, timed: Timed) -> Mission:
         now, phase = state_at_start(mission), cast("Go", mission.phases[k])
         for number, before in enumerate(mission.phases[:k]):
             leg = timed(mission, before, now, number)
-            if not leg.known:
+            if not leg.has_known_ways:
                 raise error_of_key(mission, k, "kind", "go", "begins where distances alone have led",
                               "give the formation a shape or slots")  # fmt: skip
-            now = leg.after
+            now = leg.planned_end_state
         mission = _Search(mission, k, phase, now, timed).mission_with_way()
     return mission
 
@@ -103,24 +103,24 @@ class _Search:
 
     def _near_obstacles(self) -> list[Any]:
         """Obstacles at rest that may stand in the way."""
-        low, high = self._domain
+        low, high = self._search_box
         return [
             thing
             for thing in self.mission.obstacles
             if not thing.solid.moves
-            and (extent(thing.solid)[0] <= high + self.reach + 1.0).all()
-            and (extent(thing.solid)[1] >= low - self.reach - 1.0).all()
+            and (swept_extent(thing.solid)[0] <= high + self.reach + 1.0).all()
+            and (swept_extent(thing.solid)[1] >= low - self.reach - 1.0).all()
         ]
 
     @property
-    def _domain(self) -> Floats:
+    def _search_box(self) -> Floats:
         """Lowest and highest place (2, 3) [m] of the centre of mass that is looked at."""
         ends = np.array([self.begin, self.end])
         low, high = ends.min(axis=0), ends.max(axis=0)
         around = float(np.linalg.norm(high - low)) + 4.0 * self.reach
         room = np.array([low - around, high + around])
         for thing in self.mission.obstacles:
-            a, b = extent(thing.solid)
+            a, b = swept_extent(thing.solid)
             if not thing.solid.moves and (a <= room[1]).all() and (b >= room[0]).all():
                 low = np.minimum(low, np.maximum(a, room[0]))
                 high = np.maximum(high, np.minimum(b, room[1]))
@@ -151,18 +151,18 @@ class _Search:
             if more and (best is not None or len(self.shapes) > _FEW):
                 break
             shapes = [s for s in self.shapes if s.stage <= stage]
-            report(
+            report_step(
                 f"looking for a way of '{self.phase.name}' round obstacles, shapes: {len(shapes)}"
             )
             roadmap = self._roadmap(shapes, need, more=more)
-            way = roadmap.shortest((self.begin, 0), (self.end, self._last))
+            way = roadmap.shortest_way((self.begin, 0), (self.end, self._last))
             if way is not None and (best is None or way.cost < best[1].cost):
                 best = roadmap, way
             if best is not None and best[1].cost <= _SHORT * straight + self.reach:
                 break
         if best is None:
             raise self._no_way_error(roadmap)
-        return best[0], best[0].shorten(best[1])
+        return best[0], best[0].shorten_way(best[1])
 
     def _roadmap(self, shapes: list[layers.CandidateShape], need: float, *, more: bool) -> Roadmap:
         frames = layers.lattice_axes(self._near_obstacles())
@@ -176,7 +176,7 @@ class _Search:
             yaws |= layers.narrow_yaws(shape.slots, self.start, frames)
         angles = [self.start]
         for a in (self.goal, *((roll, pitch, yaw) for yaw in sorted(yaws))):
-            if all(layers.angle_between(a, b) > 1e-6 for b in angles):
+            if all(layers.angle_between_attitudes(a, b) > 1e-6 for b in angles):
                 angles.append(a)
         turns = [att.dcm_from_euler(np.deg2rad(a)) for a in angles]
         nodes = [
@@ -185,11 +185,11 @@ class _Search:
             for a, T in zip(angles, turns, strict=True)
         ]
         self._last = min(
-            range(len(angles)), key=lambda k: layers.angle_between(angles[k], self.goal)
+            range(len(angles)), key=lambda k: layers.angle_between_attitudes(angles[k], self.goal)
         )
         common = []
         for frame in frames:
-            points = corners(*self._domain) @ frame.T
+            points = box_corners(*self._search_box) @ frame.T
             low, high = points.min(axis=0), points.max(axis=0)
             ends = np.array([self.begin, self.end]) @ frame.T
             count = np.clip(np.ceil((high - low) / (2.0 * self.reach)), *_EVEN).astype(int)
@@ -217,7 +217,7 @@ class _Search:
                 way_of = changes[frozenset((i, j))]
                 yield f"take {name}", {"kind": "reshape", "formation": name}, way_of
             else:
-                keys: dict[str, Any] = {"kind": "turn"} | _angles(layer.angles)
+                keys: dict[str, Any] = {"kind": "turn"} | _attitude_keys(layer.angles)
                 yield f"turn to {layer.angles[2]:.4g}°", keys, changes[frozenset((i, j))]
 
     def _names_in_file(self) -> dict[str, str]:
@@ -229,7 +229,7 @@ class _Search:
             if p.shaping is not None
         }
 
-    def _tables(self, roadmap: Roadmap, way: Way) -> list[dict[str, Any]]:
+    def _phase_tables(self, roadmap: Roadmap, way: Way) -> list[dict[str, Any]]:
         """The phases of a way as tables; times are shared like the roots of the longest ways, or automatic."""
         phase = self.phase
         parts = list(self._parts(roadmap, way))
@@ -249,7 +249,7 @@ class _Search:
             tables.append(table)
         last = tables[-1]
         if phase.attitude_deg is not None and last["kind"] == "fly":
-            last |= _angles(phase.attitude_deg)
+            last |= _attitude_keys(phase.attitude_deg)
         if phase.duration != AUTO:
             before = [float(t["duration"]) for t in tables[:-1]]
             last["duration"] = round(end - self.now.t - sum(before), 6)
@@ -263,7 +263,7 @@ class _Search:
     def _try_way(self, roadmap: Roadmap, way: Way) -> tuple[Mission, float]:
         """The mission with a way, and the clearance [m] that its proof lacks: that of every vehicle, in time."""
         mission, k = self.mission, self.number
-        data, tables = mission.to_dict(), self._tables(roadmap, way)
+        data, tables = mission.to_dict(), self._phase_tables(roadmap, way)
         forms = {
             name: mission.formations[name].model_dump(
                 mode="json", exclude_none=True, exclude_defaults=True
@@ -281,7 +281,7 @@ class _Search:
         self._worst = ""
         for number in range(k, k + len(tables)):
             leg = self.timed(tried, tried.phases[number], now, number)
-            now = leg.after
+            now = leg.planned_end_state
             lacking = max(lacking, self._missing_clearance(tried, leg))
         return tried, lacking
 
@@ -319,14 +319,14 @@ class _Search:
                     f" than {self.phase.clearance:g} m"
                 )
                 return mistake(problem, "move it, or ask for less clearance")
-        least, place, layer = roadmap.widest((self.begin, 0), (self.end, self._last))
+        least, place, layer = roadmap.widest_way((self.begin, 0), (self.end, self._last))
         x, (_, _, thing) = roadmap.layers[layer], self._tightest(roadmap, place, layer)
         where = ", ".join(f"{v:z.2f}" for v in place)
         problem = (
             f"no way is found: at the narrowest place of the best one, ({where}) m, '{x.formation}' at yaw"
             f" {x.angles[2]:.4g}° "
         ) + (
-            self._gap(roadmap, place, layer)
+            self._gap_in_words(roadmap, place, layer)
             or f"has {least:.2f} m of clearance from {thing}, {roadmap.need - least:.2f} m less than asked for"
         )
         remedy = "allow a slimmer formation (formations, scales), ask for less clearance, or name points on the way"
@@ -335,13 +335,13 @@ class _Search:
     def _tightest(self, roadmap: Roadmap, place: Floats, layer: int) -> tuple[float, int, str]:
         """The least room [m] of an agent at a place, the agent, and what is nearest to it."""
         r, space = place + roadmap.layers[layer].offsets, roadmap.space
-        room = space.room(r, roadmap.radius)
+        room = space.room_at(r, roadmap.radius)
         _, near = proximity.obstacle_clearances(r, roadmap.radius, space.obstacles)
         agent = int(room.argmin())
         thing = f"'{space.obstacles[near[agent]].name}'" if near[agent] >= 0 else "the geofence"
         return float(room[agent]), agent, thing
 
-    def _gap(self, roadmap: Roadmap, place: Floats, layer: int) -> str:
+    def _gap_in_words(self, roadmap: Roadmap, place: Floats, layer: int) -> str:
         """What a shape needs in the gap between the two nearest obstacles; "" if they do not lie on two sides of it."""
         x, boxes = roadmap.layers[layer], []
         for other in roadmap.space.obstacles:
@@ -351,7 +351,7 @@ class _Search:
         if len(boxes) < 2:
             return ""
         (_, one), (_, two) = boxes[:2]
-        (a, b), (c, d) = extent(one.solid), extent(two.solid)
+        (a, b), (c, d) = swept_extent(one.solid), swept_extent(two.solid)
         wide = np.maximum(a - d, c - b)
         k = int(np.where(np.isfinite(wide), wide, -np.inf).argmax())
         if wide[k] <= 0.0:
@@ -367,7 +367,7 @@ class _Search:
         )
 
 
-def _angles(angles: layers.Angles) -> dict[str, float]:
+def _attitude_keys(angles: layers.Angles) -> dict[str, float]:
     """Keys of an attitude; angles of zero need none, but for the yaw."""
     return {k: x for k, x in zip(ANGLES, angles, strict=True) if x or k == "yaw_deg"}
 

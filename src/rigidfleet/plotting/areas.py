@@ -26,7 +26,7 @@ _SOFT = 0, (4, 2)
 _FALLS, _MOST, _NAMED = "#E69F00", 4000, 6
 
 
-def areas(mission: Mission) -> list[tuple[str, list[Floats], dict[str, Any]]]:
+def drawn_areas(mission: Mission) -> list[tuple[str, list[Floats], dict[str, Any]]]:
     """Name, rings (m, 2) [m] and look of each fence and place with people; hatched where no vehicle may be."""
     drawn: list[tuple[Area, dict[str, Any]]] = []
     for fence in mission.fences:
@@ -39,28 +39,28 @@ def areas(mission: Mission) -> list[tuple[str, list[Floats], dict[str, Any]]]:
     return [(area.name, area.rings(mission.geodetic_origin), look) for area, look in drawn]
 
 
-def draw_from_above(ax: Axes, mission: Mission) -> None:
+def draw_areas_from_above(ax: Axes, mission: Mission) -> None:
     """Draw fences and people from above, with their names as far as these fit."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
-    for name, rings, look in areas(mission):
+    for name, rings, look in drawn_areas(mission):
         path = Path.make_compound_path(*(Path([*ring, ring[0]], closed=True) for ring in rings))
         patch = ax.add_patch(PathPatch(path, **look, zorder=1.2, gid="area"))
         low, high = rings[0].min(axis=0), rings[0].max(axis=0)
         st.name_box(ax, patch, 0.5 * (low[0] + high[0]), low[1], name)
 
 
-def draw_in_space(ax: Axes3D, mission: Mission, floor: float) -> None:
+def draw_areas_in_space(ax: Axes3D, mission: Mission, floor: float) -> None:
     """Draw fences and people on a plane at a height [m]."""
-    for _, rings, look in areas(mission):
+    for _, rings, look in drawn_areas(mission):
         style = {key: look[key] for key in ("linewidth", "linestyle") if key in look}
         for ring in rings:
             x, y = np.vstack([ring, ring[:1]]).T
             ax.plot(x, y, np.full(len(x), floor), color=look["edgecolor"], **style, zorder=1)
 
 
-def falls_of(result: Result) -> Floats:
+def fall_places_by_sample(result: Result) -> Floats:
     """Where each vehicle falls that fails at a sample: places (K, N, 2) [m], on the ground, or at z = 0 without one.
 
     Terrain and roofs count at some heights of each fall. NaN where nothing falls, for want of gravity.
@@ -69,17 +69,17 @@ def falls_of(result: Result) -> Floats:
 
     if result.mission.gravity < 1.0:
         return np.full((*result.position.shape[:2], 2), np.nan)
-    return Boundaries(result.mission).ends(result.position, result.velocity)[..., :2]
+    return Boundaries(result.mission).ends_of_falls(result.position, result.velocity)[..., :2]
 
 
 @st.figure_of()
-def sketch(result: Result, falls: Floats) -> Figure:
-    """The ground from above: fences, people, and where vehicles fly and fall (`falls_of`)."""
+def draw_ground(result: Result, falls: Floats) -> Figure:
+    """The ground from above: fences, people, and where vehicles fly and fall (`fall_places_by_sample`)."""
     from matplotlib.patches import Patch
 
     fig = st.blank_figure(5.2, 3.6, "constrained")
     ax = fig.subplots()
-    draw_from_above(ax, result.mission)
+    draw_areas_from_above(ax, result.mission)
     handles = []
     for what, places, colour in (
         ("vehicles that fail fall", falls, _FALLS),
@@ -88,7 +88,7 @@ def sketch(result: Result, falls: Floats) -> Figure:
         flat = places[result.left]
         ax.plot(*flat[:: 1 + len(flat) // _MOST].T, ".", markersize=2, color=colour, zorder=2)
         handles.append(st.legend_entry(what, linestyle="", marker="o", markersize=5, color=colour))
-    for name, _, look in areas(result.mission)[:_NAMED]:
+    for name, _, look in drawn_areas(result.mission)[:_NAMED]:
         handles.append(Patch(label=st.clean_name(name), **look))
     ax.set(xlabel="x, east [m]", ylabel="y, north [m]")
     ax.margins(0.06)

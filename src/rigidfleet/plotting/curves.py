@@ -187,7 +187,7 @@ def _widen_limits(ax: Axes, least: float) -> None:
 
 def _waypoint_values(result: Result, key: str) -> list[tuple[float, Any]]:
     """Time [s] and value of the waypoints that the flight reached."""
-    values = [(at["time"], at.get(key)) for _, at in st.targets(result)]
+    values = [(at["time"], at.get(key)) for _, at in st.phase_targets(result)]
     return [(t, value) for t, value in values if value is not None and t <= result.time[-1] + 1e-9]
 
 
@@ -354,7 +354,7 @@ def shape_error(result: Result) -> Floats:
     return error
 
 
-def draw_error(ax: Axes, result: Result) -> list[Line2D]:
+def draw_constraint_error(ax: Axes, result: Result) -> list[Line2D]:
     """Draw the errors |c| of the edges, the greatest, and that of all pairs; return legend entries of the last two."""
     ax.set_ylabel("error |c| of an edge [m]")
     size, shape = np.abs(result.constraint), shape_error(result)
@@ -390,7 +390,7 @@ def constraint_error(result: Result) -> Figure:
     title = "Constraint error, and shape error of all pairs against the slots"
     fig, axes = st.time_figure(result, title, 1, height=3.6)
     ax = axes[0, 0]
-    if handles := draw_error(ax, result):
+    if handles := draw_constraint_error(ax, result):
         st.draw_legend(ax, [*handles, *(edge_handles(result) if len(result.edges) else [])])
     return fig
 
@@ -424,7 +424,7 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
     ax.plot(result.time, values, color=st.TONES[0])
     st.draw_limit(ax, limit, f"limit {limit:g} m")
     if name == "separation":
-        _draw_planned(ax, result)
+        _draw_planned_separation(ax, result)
         if (flying := QUANTITIES["separation_flying"].limit_of(result.mission)) is not None:
             altitude = result.mission.limits.separation_altitude
             st.draw_limit(ax, flying, f"limit {flying:g} m from z = {altitude:g} m on")
@@ -443,7 +443,7 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
     ax.set_ylim(min(low, 0.0) - room, max(high, 0.0) + room)
 
 
-def _draw_planned(ax: Axes, result: Result) -> None:
+def _draw_planned_separation(ax: Axes, result: Result) -> None:
     """The separation that the plan of each phase proves, less what is allowed for tracking."""
     allowed = result.mission.limits.separation_allowance
     proved = [(p.planned["separation"] - allowed, p) for p in result.phases if p.planned]
@@ -453,7 +453,7 @@ def _draw_planned(ax: Axes, result: Result) -> None:
         st.write_above(ax, f"dotted: as planned, less {allowed:g} m")
 
 
-def _distances_shown(result: Result) -> list[str]:
+def _names_of_least_distances(result: Result) -> list[str]:
     """Which least distances there are."""
     mission, several = result.mission, result.n_agents > 1
     there = {
@@ -465,10 +465,10 @@ def _distances_shown(result: Result) -> list[str]:
     return [name for name in there if there[name]]
 
 
-@st.figure_of(_distances_shown, "only one agent, and nothing near it")
+@st.figure_of(_names_of_least_distances, "only one agent, and nothing near it")
 def clearance(result: Result) -> Figure:
     """Distances between surfaces, with the limits."""
-    names = _distances_shown(result)
+    names = _names_of_least_distances(result)
     height = 3.2 if len(names) == 1 else 1.8
     fig, axes = st.time_figure(result, "Clearance between surfaces", len(names), height=height)
     for name, ax in zip(names, axes[:, 0], strict=True):

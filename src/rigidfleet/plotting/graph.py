@@ -26,7 +26,7 @@ _ARROW = 0.35
 _DRAWN = 3
 
 
-def graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
+def formation_graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
     """Graph of each formation with its rigidity; arrows show the first free motions, each in a tone of its own."""
     names = list(mission.formations)
     with st.apply_style():
@@ -53,7 +53,7 @@ def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: P
         raise ResultError(
             f"{path}: the name has no figure format. Give a name that ends in {known}."
         )
-    (drawn,) = encode_figure(graphs(mission, judged), [path.suffix[1:]]).values()
+    (drawn,) = encode_figure(formation_graphs(mission, judged), [path.suffix[1:]]).values()
     write_file(path, drawn, parents=True)
 
 
@@ -67,7 +67,7 @@ def _draw_formation(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | 
         words += f", {len(redundant)} redundant" if redundant else ""
     sideways = rigidity is not None and any(f.motion[:, 2].any() for f in rigidity.flexes)
     look: dict[str, Any] = {"most": _FEW, "dashed": dashed, "sideways": sideways}
-    drawn = sketches.sketch(ax, mission, name, colours, words, **look)
+    drawn = sketches.draw_formation_sketch(ax, mission, name, colours, words, **look)
     if rigidity is not None:
         _draw_free_motions(ax, drawn.p, drawn.turn, rigidity)
 

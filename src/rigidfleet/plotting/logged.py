@@ -47,19 +47,19 @@ class OffPlan(NamedTuple):
     limit: float
 
     @property
-    def interval(self) -> Floats:
+    def distance_interval(self) -> Floats:
         """From what to what (2, K, N) [m] the distances are."""
         return np.stack([np.maximum(self.far - self.doubt, 0.0), self.far + self.doubt])
 
     @property
-    def is_off(self) -> Bools:
+    def is_beyond_limit(self) -> Bools:
         """Who is surely beyond the limit (K, N)."""
-        return self.interval[0] > self.limit
+        return self.distance_interval[0] > self.limit
 
     def drift_spans(self, time: Floats) -> list[Drift]:
         """Each time in which a vehicle is off, those of one after the other."""
         drifts = []
-        for i, off in enumerate(self.is_off.T):
+        for i, off in enumerate(self.is_beyond_limit.T):
             k = np.flatnonzero(off)
             again = (np.diff(k) > 1) & (np.diff(time[k]) >= _SOON)
             for part in np.split(k, np.flatnonzero(again) + 1)[: len(k)]:
@@ -109,7 +109,7 @@ def plan_and_flight(result: Result) -> Figure:
     colours, names = st.agent_colours(n), log_names(result)
     # Of many vehicles, those that are off the most.
     shown = np.sort(np.argsort(-np.fmax.reduce(off.far, axis=0))[:_SHOWN]).tolist()
-    low, high = 1e3 * off.interval
+    low, high = 1e3 * off.distance_interval
     for i in shown:
         look: dict[str, Any] = {"color": colours[i]}
         above.plot(*result.position[:, i, :2].T, **look, linewidth=1.4)

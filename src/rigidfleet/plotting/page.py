@@ -28,7 +28,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
     """Three Euler angles in one axes, dark to light; without an attitude, the constraint error."""
     flown, wanted, _ = curves.flown_and_wanted_euler(result)
     if not np.isfinite(flown).any():
-        entries = curves.draw_error(ax, result)
+        entries = curves.draw_constraint_error(ax, result)
         ax.yaxis.labelpad = 2  # powers of ten are wide
         if entries:
             _legend_above(ax, entries)
@@ -53,9 +53,9 @@ def summary(result: Result) -> Figure:
     """
     fig = st.blank_figure(11.4, 7.0)
     st.draw_head(fig, result, st.clean_name(result.mission.title, 80) or "Flight")
-    view = space.scene(result)
-    space.draw_space(fig, result, view, (0.0, 0.49, 0.41, 0.47))
-    space.draw_above(fig.add_axes((0.45, 0.56, 0.22, 0.36)), result, view)
+    view = space.trajectory_scene(result)
+    space.draw_trajectory_in_space(fig, result, view, (0.0, 0.49, 0.41, 0.47))
+    space.draw_trajectory_from_above(fig.add_axes((0.45, 0.56, 0.22, 0.36)), result, view)
     lengths = fig.add_axes((0.73, 0.56, 0.255, 0.345))
     angles, thrust, apart = (fig.add_axes((x, 0.165, 0.27, 0.285)) for x in (0.05, 0.385, 0.715))
     over_time = (lengths, angles, thrust, apart)
@@ -68,13 +68,13 @@ def summary(result: Result) -> Figure:
     elif result.mission.obstacles and result.n_agents > 1:
         curves.draw_least(lengths, result, "separation")
     else:
-        curves.draw_error(lengths, result)
+        curves.draw_constraint_error(lengths, result)
     if 0 < len(result.edges) <= curves.SINGLE:
         _legend_above(lengths, curves.edge_handles(result))
     _draw_attitude(angles, result)
     curves.draw_thrust(thrust, result)
     curves.draw_least(apart, result, "clearance" if result.mission.obstacles else "separation")
-    entries = space.legend_handles(result, view)
+    entries = space.trajectory_handles(result, view)
     fig.legend(
         handles=entries, loc="lower center", ncols=math.ceil(len(entries) / (1 if len(entries) <= 10 else 2)),
         bbox_to_anchor=(0.5, 0.058), labelspacing=0.2,

@@ -61,13 +61,13 @@ def rotors(result: Result) -> Figure:
     """Greatest force of a rotor of each vehicle as a share of its limit; all rotors of the one nearest to its limit."""
     fig, axes = st.time_figure(result, "Force of the rotors", 2)
     above, below = axes[:, 0]
-    _draw_greatest(above, result)
+    _draw_greatest_rotor(above, result)
     st.draw_agents_legend(above, result.n_agents)
-    _draw_nearest(below, result)
+    _draw_rotors_of_nearest(below, result)
     return fig
 
 
-def _draw_greatest(ax: Axes, result: Result) -> None:
+def _draw_greatest_rotor(ax: Axes, result: Result) -> None:
     """The greatest of the four rotors of each vehicle, as a share of its limit."""
     limits = rotor_limits(result.mission)
     share, between = (
@@ -80,7 +80,7 @@ def _draw_greatest(ax: Axes, result: Result) -> None:
     Panel(ax, result, share, "%", between).draw([(100.0, "limit", st.ALERT)])
 
 
-def _draw_nearest(ax: Axes, result: Result) -> None:
+def _draw_rotors_of_nearest(ax: Axes, result: Result) -> None:
     """The four rotors of the vehicle that comes nearest to its limit, enlarged."""
     limits, force = rotor_limits(result.mission), rotor_forces(result)
     peak = np.fmax.reduce(force, axis=(0, 2)) / limits

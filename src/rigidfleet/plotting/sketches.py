@@ -11,7 +11,7 @@ import numpy as np
 from rigidfleet.formation import distance_geometry
 from rigidfleet.plotting import curves
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.space import camera
+from rigidfleet.plotting.space import camera_axes
 from rigidfleet.result import Result
 from rigidfleet.result.lights import plane_view
 from rigidfleet.typing import Floats
@@ -84,7 +84,7 @@ def _draw_formation(ax: Axes, result: Result, name: str) -> None:
     words = formation.shape or ("slots" if formation.slots is not None else "by distances")
     words += f", {len(edges)} edge{'s' if len(edges) != 1 else ''}" * bool(edges)
     of_edge = [colours[i, j] for i, j in edges]
-    drawn = sketch(ax, mission, name, of_edge, words, most=curves.SINGLE)
+    drawn = draw_formation_sketch(ax, mission, name, of_edge, words, most=curves.SINGLE)
     if drawn.placed and mission.n_agents > 1 and not mission.formation_colours(name):
         share = (0.3, 0.3, 0.42, 0.5)[distance_geometry.dimension(drawn.p, 1e-3)]
         _draw_axes(ax, drawn.turn.T, share * float(np.linalg.norm(drawn.p, axis=1).max()))
@@ -101,7 +101,7 @@ class Sketch(NamedTuple):
     turn: Floats
 
 
-def sketch(
+def draw_formation_sketch(
     ax: Axes, mission: Mission, name: str, colours: list[str], words: str, *,
     most: int, dashed: Sequence[bool] = (), sideways: bool = False,
 ) -> Sketch:  # fmt: skip
@@ -117,9 +117,9 @@ def sketch(
     flat = thin and distance_geometry.dimension(p, 1e-3) < 3
     turn, lit = np.eye(3), mission.formation_colours(name)
     if lit:
-        turn = camera(*np.degrees(plane_view(p)))
+        turn = camera_axes(*np.degrees(plane_view(p)))
     elif sideways or not flat:
-        turn = camera(-70.0, 30.0 if flat else 16.0)
+        turn = camera_axes(-70.0, 30.0 if flat else 16.0)
     words += "" if placed else "; their distances fix no positions"
     ax.set_title(st.clean_name(name), pad=22, fontsize=9, fontweight="bold", parse_math=False)
     at: dict[str, Any] = {"transform": ax.transAxes, "ha": "center", "parse_math": False}

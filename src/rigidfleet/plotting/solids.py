@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.plotting import style as st
-from rigidfleet.solids.outline import Outline, displacements_at, outline
+from rigidfleet.solids.outline import Outline, displacements_at, outline_of_solid
 from rigidfleet.solids.records import HEIGHTS
 from rigidfleet.typing import Floats
 
@@ -42,7 +42,7 @@ class DrawnObstacle:
     grid: tuple[Floats, Floats, Floats] | None  # x, y and heights of a height map
 
     @property
-    def terrain(self) -> bool:
+    def is_terrain(self) -> bool:
         """Whether it is a height map."""
         return self.grid is not None
 
@@ -59,7 +59,7 @@ def drawn_obstacles(
     """Obstacles over a time [s], as far as they come near the space from low to high (3,), where boxes are cut."""
     near_obstacles = []
     for thing in mission.solids:
-        solid, surface = thing.solid, outline(thing.solid)
+        solid, surface = thing.solid, outline_of_solid(thing.solid)
         if plain := thing.corners is not None and not thing.zone:
             surface = Outline(*(np.clip(x, low, high) for x in surface))
         at = way = np.zeros((1, 3))
@@ -87,7 +87,7 @@ def _opacities(shape: DrawnObstacle) -> Floats:
     return np.linspace(_FIRST, 1.0, n) if n > 1 else np.ones(1)
 
 
-def draw_in_space(ax: Axes3D, shape: DrawnObstacle) -> None:
+def draw_obstacle_in_space(ax: Axes3D, shape: DrawnObstacle) -> None:
     """Draw an obstacle in three dimensions: lit faces, the lines of its shape, and its way."""
     from matplotlib.colors import LightSource, to_rgb, to_rgba
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
@@ -106,14 +106,14 @@ def draw_in_space(ax: Axes3D, shape: DrawnObstacle) -> None:
             paint = tuple(1.0 - opacity * (1.0 - np.array(to_rgb(colour))))
         look: dict[str, Any] = {"linewidths": 0, "antialiaseds": shape.zone}
         look |= {"shade": True, "lightsource": LightSource(_FROM, _ABOVE)}
-        zorder = 0.5 if shape.terrain else 2
+        zorder = 0.5 if shape.is_terrain else 2
         sides = Poly3DCollection(faces + at, facecolors=[paint], **look, zorder=zorder)
         sides.set_gid("obstacle")
         ax.add_collection3d(sides)
         ax.add_collection3d(
             Line3DCollection(
                 list(shape.surface.lines + at), colors=colour, linewidths=0.5, linestyles=dashes,
-                alpha=0.9 * float(share), zorder=0.6 if shape.terrain else 2.1,
+                alpha=0.9 * float(share), zorder=0.6 if shape.is_terrain else 2.1,
             )
         )  # fmt: skip
     if len(shape.way) > 1:
@@ -133,7 +133,7 @@ def seen_from_above(triangles: Floats) -> Path:
     return Path.make_compound_path(*(Path([*x, x[0]], closed=True) for x in flat))
 
 
-def draw_from_above(ax: Axes, shape: DrawnObstacle) -> None:
+def draw_obstacle_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     """Draw an obstacle from above: its outline at each place, its way, contours of a height map, and its name."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import LinearSegmentedColormap
@@ -149,7 +149,7 @@ def draw_from_above(ax: Axes, shape: DrawnObstacle) -> None:
         ax.contourf(x, y, z.T, 8, cmap=low_to_high, alpha=0.5, zorder=0.8)
         ax.contour(x, y, z.T, 8, colors=colour, linewidths=0.4, alpha=0.8, zorder=0.9)
     for at, share in zip(shape.at, _opacities(shape), strict=True):
-        opacity = 0.0 if shape.terrain else 0.3 if not shape.zone else 0.1
+        opacity = 0.0 if shape.is_terrain else 0.3 if not shape.zone else 0.1
         path = seen_from_above(shape.surface.triangles + at)
         patch = ax.add_patch(PathPatch(path, **look, alpha=opacity * float(share)))
         if shape.zone:

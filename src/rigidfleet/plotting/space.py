@@ -13,7 +13,7 @@ from rigidfleet.plotting import style as st
 from rigidfleet.result import Result
 from rigidfleet.result.lights import has_lights, lights
 from rigidfleet.result.lights import view_angles as seen
-from rigidfleet.solids.records import corners
+from rigidfleet.solids.records import box_corners
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class Scene:
     waypoints: list[tuple[str, Floats]]
 
 
-def scene(result: Result) -> Scene:
+def trajectory_scene(result: Result) -> Scene:
     """Content of the trajectory figure."""
     mission, r = result.mission, result.position
     rows = np.flatnonzero(np.isfinite(r).all(axis=(1, 2)))
@@ -64,7 +64,7 @@ def scene(result: Result) -> Scene:
     begin, end = float(result.time[0]), float(result.time[-1])
     shapes = solids.drawn_obstacles(mission, begin, end, low - near, high + near)
     seen_too = [np.clip(shape.extent, low - near, high + near) for shape in shapes]
-    for _, rings, _ in areas.areas(mission):
+    for _, rings, _ in areas.drawn_areas(mission):
         flat = np.concatenate(rings)
         ends = np.array([[*f(flat, axis=0), z] for f, z in ((np.min, low[2]), (np.max, high[2]))])
         seen_too.append(np.clip(ends, low - near, high + near))
@@ -83,7 +83,7 @@ def scene(result: Result) -> Scene:
 def _waypoints(result: Result) -> list[tuple[str, Floats]]:
     """Short name and position of each waypoint, once for each position."""
     names: dict[tuple[float, ...], str] = {}
-    for phase, at in st.targets(result):
+    for phase, at in st.phase_targets(result):
         if at.get("position") is not None:
             place = tuple(np.round(np.asarray(at["position"], dtype=float), 6).tolist())
             names.setdefault(place, st.clean_name(phase.name.split(":")[0], 12))
@@ -147,7 +147,7 @@ def _edge_segments(result: Result, shots: list[int]) -> Floats:
 def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
     """Draw paths, agents at the drawn samples, start, end and waypoints, in 2 or 3 axes."""
     for _, place in view.waypoints:
-        ax.plot(*place[:axes, None], **_cross(result), zorder=7)
+        ax.plot(*place[:axes, None], **_waypoint_look(result), zorder=7)
     n, night, shots = result.n_agents, has_lights(result), result.position[view.shots, :, :axes]
     colours = [st.GREY] * n if night else st.agent_colours(n)
     width, alpha = (0.4, 0.3) if night else (0.4, 0.5) if n > st.MANY else (0.8, 0.9)
@@ -160,7 +160,7 @@ def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
         r = shots.reshape(-1, axes)
         ax.scatter(*r.T, s=5, c=shown, linewidths=0, zorder=5, gid="lights", **look)
     elif n > st.MANY:
-        _draw_many(ax, shots, colours)
+        _draw_many_agents(ax, shots, colours)
     else:
         for colour, r in zip(colours, shots.transpose(1, 2, 0), strict=True):
             ax.plot(*r, **st.marker_look(colour, 3), zorder=5)
@@ -168,7 +168,7 @@ def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
             ax.plot(*r[:, -1:], **st.marker_look(colour, 5, marker="s"), zorder=6, gid="end")
 
 
-def _draw_many(ax: Axes, shots: Floats, colours: list[str]) -> None:
+def _draw_many_agents(ax: Axes, shots: Floats, colours: list[str]) -> None:
     """Draw many agents at places (K, N, axes); the first are hollow, the last squares."""
     last = len(shots) - 1
     for k, r in enumerate(shots):
@@ -178,7 +178,7 @@ def _draw_many(ax: Axes, shots: Floats, colours: list[str]) -> None:
         ax.scatter(*r.T, s=4 if k in (0, last) else 3, **look, zorder=6 if hollow else 5)
 
 
-def _cross(result: Result) -> dict[str, Any]:
+def _waypoint_look(result: Result) -> dict[str, Any]:
     """Look of a waypoint, which is seen at night, too."""
     colour = st.GREY if has_lights(result) else st.INK
     return st.marker_look(colour, 7, marker="+") | {"markeredgewidth": 1.3}
@@ -196,7 +196,7 @@ def _name_look(result: Result) -> dict[str, Any]:
 # -- three dimensions --------------------------------------------------------------------------------
 
 
-def draw_space(
+def draw_trajectory_in_space(
     fig: Figure, result: Result, view: Scene, rect: tuple[float, float, float, float]
 ) -> Axes3D:
     """Draw the trajectory in three dimensions, with one scale on all axes, as large as `rect` of the figure allows."""
@@ -218,12 +218,12 @@ def draw_space(
         azimuth, elevation = np.degrees(seen(result)) + [_ASIDE, 0.0]
         elevation = min(max(elevation, _LOW), _HIGH)
     if view.ground and not night:
-        flat = corners(low, high)[[0, 2, 6, 4]]
+        flat = box_corners(low, high)[[0, 2, 6, 4]]
         flat[:, 2] = view.floor
         ax.add_collection3d(Poly3DCollection([flat], facecolor=_GROUND, alpha=0.8, zorder=0))
     for shape in view.shapes:
-        solids.draw_in_space(ax, shape)
-    areas.draw_in_space(ax, result.mission, view.floor)
+        solids.draw_obstacle_in_space(ax, shape)
+    areas.draw_areas_in_space(ax, result.mission, view.floor)
     shadow = np.full(len(view.centre), view.floor)
     ax.plot(*view.centre[:, :2].T, shadow, color=st.FAINT, linewidth=1.0, zorder=1)
     edges = _edge_segments(result, view.shots)
@@ -266,7 +266,7 @@ def _fit_axes(
     side, margin = max(width, height), 0.55 * fig.dpi  # for tick and axis labels
     corner = left + (width - side) / 2, bottom + (height - side) / 2
     ax.set_position((*(corner / size), *(side / size)))
-    extent = np.ptp(_on_screen(ax, corners(view.low, view.high)), axis=0)
+    extent = np.ptp(_on_screen(ax, box_corners(view.low, view.high)), axis=0)
     zoom = min((width - 2 * margin) / extent[0], (height - 2 * margin) / extent[1])
     ax.set_box_aspect([float(s) for s in view.high - view.low], zoom=zoom)
 
@@ -274,7 +274,7 @@ def _fit_axes(
 # -- from above --------------------------------------------------------------------------------------
 
 
-def draw_above(ax: Axes, result: Result, view: Scene) -> None:
+def draw_trajectory_from_above(ax: Axes, result: Result, view: Scene) -> None:
     """Draw the trajectory from above, with one scale on both axes."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
@@ -287,8 +287,8 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
         ax.set_facecolor(st.NIGHT)
         ax.grid(visible=False)
     for shape in view.shapes:
-        solids.draw_from_above(ax, shape)
-    areas.draw_from_above(ax, result.mission)
+        solids.draw_obstacle_from_above(ax, shape)
+    areas.draw_areas_from_above(ax, result.mission)
     fence = result.mission.limits.geofence
     if fence is not None:
         look: dict[str, Any] = {"fill": False, "edgecolor": st.ALERT, "linestyle": (0, (6, 2))}
@@ -305,9 +305,9 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
         ax.annotate(names, (x, y), (away, 4), **look)
 
 
-def legend_handles(result: Result, view: Scene) -> list[Any]:
+def trajectory_handles(result: Result, view: Scene) -> list[Any]:
     """Legend entries of a trajectory."""
-    waypoints = [st.legend_entry("waypoint", **_cross(result))] if view.waypoints else []
+    waypoints = [st.legend_entry("waypoint", **_waypoint_look(result))] if view.waypoints else []
     if has_lights(result):
         return waypoints
     ends = [
@@ -323,17 +323,17 @@ def trajectory(result: Result) -> Figure:
     wide = st.figure_width(10.5)
     fig = st.blank_figure(wide, 2.2 * wide if st.is_narrow() else 6.2)
     st.draw_head(fig, result, "Trajectory")
-    view = scene(result)
-    entries = legend_handles(result, view)
+    view = trajectory_scene(result)
+    entries = trajectory_handles(result, view)
     columns = max(1, min(len(entries), max(int(0.9 * wide), 2) if st.is_narrow() else 11))
     if st.is_narrow():  # the view from above stands below
-        draw_space(fig, result, view, (0.0, 0.5, 1.0, 0.44))
+        draw_trajectory_in_space(fig, result, view, (0.0, 0.5, 1.0, 0.44))
         low = (0.65 + 0.18 * math.ceil(len(entries) / columns)) / fig.get_figheight()
         above = fig.add_axes((0.55 / wide, low, 0.96 - 0.55 / wide, 0.48 - low))
     else:
-        draw_space(fig, result, view, (0.0, 0.07, 0.6, 0.87))
+        draw_trajectory_in_space(fig, result, view, (0.0, 0.07, 0.6, 0.87))
         above = fig.add_axes((0.66, 0.16, 0.32, 0.74))
-    draw_above(above, result, view)
+    draw_trajectory_from_above(above, result, view)
     above.set_anchor("C")
     fig.legend(
         handles=entries, loc="lower center", ncols=columns, borderaxespad=0.8, columnspacing=1.4
@@ -341,7 +341,7 @@ def trajectory(result: Result) -> Figure:
     return fig
 
 
-def camera(azimuth: float, elevation: float) -> Floats:
+def camera_axes(azimuth: float, elevation: float) -> Floats:
     """Unit vectors right, up and towards the viewer (rows) of a camera at these angles [deg]."""
     a, e = math.radians(azimuth), math.radians(elevation)
     out = np.array([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)])

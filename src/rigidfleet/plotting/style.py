@@ -186,7 +186,7 @@ def time_figure(
     return fig, axes
 
 
-def targets(result: Result) -> list[tuple[PhaseRecord, dict[str, Any]]]:
+def phase_targets(result: Result) -> list[tuple[PhaseRecord, dict[str, Any]]]:
     """All that phases are to reach: points to pass on the way, and the target at the end."""
     reached = ((p, p.target) for p in result.phases if p.target is not None)
     return [(p, at) for p, target in reached for at in (*target.get("through", ()), target)]

@@ -40,40 +40,40 @@ class AbortsCheck(Shown):
     @property
     def least_separation(self) -> float:
         """The least separation that all ways home promise [m]."""
-        return min((x.certificate.separation for x in self.aborts if x.way), default=np.inf)
+        return min((x.certificate.separation for x in self.aborts if x.way_text), default=np.inf)
 
     def facts(self) -> Sheet:
         """Runs of orders with the same answer, each with its worst numbers."""
         options, name, all_ = self.mission.aborting, self.mission.name, len(self.aborts)
         heads = ("ordered [s]", "way home", "takes [s]", "least [m]", "one that does not hear")
-        ways = sum(bool(x.way) for x in self.aborts)
+        ways = sum(bool(x.way_text) for x in self.aborts)
         text = f"{name}: a way home from {ways} of {all_} times, {options.step:g} s apart"
         if np.isfinite(self.least_separation):
             text += f"; no two vehicles come nearer than {self.least_separation:.2f} m"
         to = "any place" if options.to == "any" else "their own places"
         parts = [
-            FactTable(heads, [*self._runs()], ("way home", "one that does not hear")),
+            FactTable(heads, [*self._rows_of_runs()], ("way home", "one that does not hear")),
             Line(text, "ok" if ways == all_ else "note"),
         ]
         return Sheet(name, f"aborts, {options.reaction:g} s after each order, to {to}", parts)
 
-    def _runs(self) -> Iterator[Row]:
+    def _rows_of_runs(self) -> Iterator[Row]:
         both = zip(self.aborts, self.unheard, strict=True)
         for _, group in itertools.groupby(
-            both, lambda x: re.sub(r"[\d.]+", "#", x[0].way or x[0].reason)
+            both, lambda x: re.sub(r"[\d.]+", "#", x[0].way_text or x[0].why_no_way)
         ):
             run = list(group)
             aborts = [abort for abort, _ in run]
             first, last = aborts[0].ordered, aborts[-1].ordered
             when = f"{first:g}" if first == last else f"{first:g} to {last:g}"
-            if not aborts[0].way:
-                yield Row((when, f"none: {aborts[0].reason}", None, None, ""), "note")
+            if not aborts[0].way_text:
+                yield Row((when, f"none: {aborts[0].why_no_way}", None, None, ""), "note")
                 continue
-            takes = max(x.end - x.ordered for x in aborts)
+            takes = max(x.rest_time - x.ordered for x in aborts)
             least = min(x.certificate.separation for x in aborts)
             worst = min((each for _, each in run if each), key=min, default=[])
             apart = least if np.isfinite(least) else None
-            yield Row((when, aborts[0].way, takes, apart, self._unheard_in_words(worst)))
+            yield Row((when, aborts[0].way_text, takes, apart, self._unheard_in_words(worst)))
 
     def _unheard_in_words(self, each: list[Worst]) -> str:
         """What follows if a vehicle does not hear, in words."""
@@ -82,10 +82,10 @@ class AbortsCheck(Shown):
         least, when, i, j = min(each)
         near = f"least {least:.2f} m," if least > 0.0 else "hits"
         text = f"{agent_names([i])} flies on: {near} {agent_names([j])} at {when:.1f} s"
-        count = self._in_danger(each)
+        count = self._count_in_danger(each)
         return text + (f"; {count} would come too near" if count else "")
 
-    def _in_danger(self, each: list[Worst]) -> int:
+    def _count_in_danger(self, each: list[Worst]) -> int:
         """How many vehicles would come within the limit of separation."""
         return sum(x.value < (self.mission.limits.separation or 0.0) for x in each)
 
@@ -98,9 +98,9 @@ class AbortsCheck(Shown):
             "aborts": [
                 {
                     "ordered_s": x.ordered, "begins_s": x.begins, "waits_s": x.waits, "stops_s": x.stop_time,
-                    "ends_s": x.end, "way": x.way, "reason": x.reason, "ways": x.home.number,
-                    "separation": _nearest(x.certificate.separation, x.certificate.time, *x.certificate.agents),
-                    "unheard": _nearest(*min(each)) if each else None, "endangered": self._in_danger(each),
+                    "ends_s": x.rest_time, "way": x.way_text, "reason": x.why_no_way, "ways": x.home.number,
+                    "separation": _pair_data(x.certificate.separation, x.certificate.time, *x.certificate.agents),
+                    "unheard": _pair_data(*min(each)) if each else None, "endangered": self._count_in_danger(each),
                 }
                 for x, each in zip(self.aborts, self.unheard, strict=True)
             ],
@@ -135,7 +135,7 @@ class AbortsCheck(Shown):
             write_file(folder / name, (json.dumps(table, indent=1) + "\n").encode())
 
 
-def _nearest(least: float, when: float, *who: int) -> dict[str, Any] | None:
+def _pair_data(least: float, when: float, *who: int) -> dict[str, Any] | None:
     """Two vehicles that come nearest, as plain data; None for one alone."""
     agents = [i + 1 for i in who]
     return {"least_m": least, "time_s": when, "agents": agents} if np.isfinite(least) else None

@@ -8,7 +8,7 @@ import numpy as np
 
 from rigidfleet.formation import assignment
 from rigidfleet.mission import Mission
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.preflight.findings import Assignment, Preflight, Remark
 
 #: A shorter assignment is reported if it saves this fraction of the path length and this length besides [m].
@@ -32,7 +32,7 @@ def assignment_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         other, planned = mission, preflight.planned_phases[index]
         if name not in ("as it is", mission.assignment):
             other = mission.with_assignment(name)
-            planned = preview(other, index + 1)[0][index]
+            planned = preview_phases(other, index + 1)[0][index]
         if planned.path_ends is None:  # on bent ways
             return
         x = planned.position - (masses @ planned.position)[:, None] / masses.sum()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rigidfleet.mission import Mission, as_mission
 from rigidfleet.mission.files import notes_on_files
-from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
+from rigidfleet.planning.preview import FEWEST_SAMPLES, preview_phases, samples_per_phase
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.planning.vehicles import lag_times, vehicle_lags
 from rigidfleet.preflight import trajectory
@@ -56,7 +56,7 @@ def check(
     search = mission.n_agents <= SEARCHED if search is None else search
     formations = check_formations(mission, search=search, progress=progress)
     progress("planned paths")
-    planned, known = preview(mission)
+    planned, known = preview_phases(mission)
     preflight = Preflight(mission, formations, check_gains(mission, formations), planned)
     preflight.speed = trajectory.greatest_speed(planned, slice(3))
     preflight.vertical_speed = trajectory.greatest_speed(planned, slice(2, 3))

@@ -18,7 +18,7 @@ from rigidfleet._common.facts import (
     Sheet,
     Shown,
     table_of,
-    worst_values,
+    table_of_worst_values,
 )
 from rigidfleet._common.plain import to_json_data
 from rigidfleet._common.text import agent_names, first_few
@@ -277,9 +277,9 @@ class Disturbed:
         """Plain data for JSON."""
         return {
             **{f"{name}_n": getattr(self, name) for name in _FORCES},
-            "thrust": _by_name("thrust_n time_s who limit_n", self.thrust),
-            "offset": _by_name("offset_m who", self.offset),
-            "lost": [_by_name("agent time_s", (i + 1, t)) for i, t in self.lost],
+            "thrust": _values_by_name("thrust_n time_s who limit_n", self.thrust),
+            "offset": _values_by_name("offset_m who", self.offset),
+            "lost": [_values_by_name("agent time_s", (i + 1, t)) for i, t in self.lost],
         }
 
 
@@ -305,10 +305,10 @@ class VehicleCheck:
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
         return {
-            "rotor_force": _by_name("force_n time_s who limit_n phase", self.rotor_force),
-            "tilt": _by_name("tilt_deg time_s who phase", self.tilt),
-            "jump": _by_name("acceleration_m_s2 tilt_deg time_s phase", self.jump),
-            "beyond": _by_name("share who phase needs", self.beyond),
+            "rotor_force": _values_by_name("force_n time_s who limit_n phase", self.rotor_force),
+            "tilt": _values_by_name("tilt_deg time_s who phase", self.tilt),
+            "jump": _values_by_name("acceleration_m_s2 tilt_deg time_s phase", self.jump),
+            "beyond": _values_by_name("share who phase needs", self.beyond),
         }
 
 
@@ -415,12 +415,12 @@ class Preflight(Shown):
         return [
             *tables,
             table_of([{"network": name} | f.row for name, f in self.network.items()]),
-            FactTable(words, [*map(Row, self._rows())], words, bare=True),
+            FactTable(words, [*map(Row, self._headed_sentences())], words, bare=True),
             table_of(ways if len(ways) > 1 else []),
-            worst_values("planned", self._worst()),
+            table_of_worst_values("planned", self._worst_facts()),
         ]
 
-    def _worst(self) -> Iterator[Fact]:
+    def _worst_facts(self) -> Iterator[Fact]:
         """Worst values of the planned paths, with their limits."""
         if self.is_show:
             places = {"start": float(proximity.nearest(self.mission.fleet.position).min())}
@@ -461,7 +461,7 @@ class Preflight(Shown):
         if self.reserve:
             yield Fact("reserve of automatic times", self.reserve, "s")
 
-    def _rows(self) -> Iterator[tuple[str, str]]:
+    def _headed_sentences(self) -> Iterator[tuple[str, str]]:
         """What is said in words, each with its heading."""
         if self.is_show:
             yield from ((f.name, words) for f in self.formations if (words := _scene_words(f)))
@@ -499,17 +499,17 @@ class Preflight(Shown):
                     planned.phase for planned in self.planned_phases if not planned.exact
                 ],
                 **{
-                    name: _by_name(f"{key} time_s who limit_n", getattr(self, name))
+                    name: _values_by_name(f"{key} time_s who limit_n", getattr(self, name))
                     for name, (key, _) in _WORST.items()
                 },
                 "certificates": [
-                    _by_name(proof, (phase, least, t, np.add(who, 1), how))
+                    _values_by_name(proof, (phase, least, t, np.add(who, 1), how))
                     for phase, (least, t, who, how) in self.certificates.items()
                 ],
                 "clearance": [
-                    _by_name("obstacle clearance_m time_s who", c) for c in self.clearance
+                    _values_by_name("obstacle clearance_m time_s who", c) for c in self.clearance
                 ],
-                "gaps": [_by_name("between wide_m takes_m time_s", g) for g in self.gaps],
+                "gaps": [_values_by_name("between wide_m takes_m time_s", g) for g in self.gaps],
                 "assignments": self.assignments,
             },
         }
@@ -596,5 +596,5 @@ def names_in_words(names: Sequence[str]) -> str:
     return f"{text} {'is' if len(names) == 1 else 'are'}"
 
 
-def _by_name(names: str, values: Sequence[Any] | None) -> dict[str, Any] | None:
+def _values_by_name(names: str, values: Sequence[Any] | None) -> dict[str, Any] | None:
     return None if values is None else dict(zip(names.split(), values, strict=False))

@@ -27,7 +27,7 @@ from rigidfleet.rigidity import (
     realisations,
     spectrum,
 )
-from rigidfleet.rigidity.analysis import WHERE, flatten
+from rigidfleet.rigidity.analysis import WHERE, flatten_points
 from rigidfleet.rigidity.realisations import follow_lengths
 from rigidfleet.rigidity.spectrum import MOST as LANCZOS
 from rigidfleet.typing import Floats
@@ -96,7 +96,7 @@ def _check_formation(
         start = _dimension_spanned(mission.fleet.position, centred(mission.fleet.velocity))
         if held == "distances" and max(start, _dimension_spanned(slots)) == 2:
             space = 2  # which they do not leave
-        points = flatten(slots, space)[0]
+        points = flatten_points(slots, space)[0]
         ends = spectrum(points, edges, masses) if len(slots) <= LANCZOS else None
         return replace(check, spectrum=ends)
     rigidity = analyse(slots, edges, masses=masses, dimension=space)
@@ -144,14 +144,14 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         yield _note(f"to limit the time of the check, {names_in_words(skipped)} skipped")
     if idle := [f.name for f in formations if f.held_by == "nothing"]:
         yield _note(f"{names_in_words(idle)} not used in any phase")
-    yield from _flat_start(mission)
+    yield from _flat_start_remarks(mission)
     soft = {
         f.name
         for f in formations
         if f.rigidity is not None and f.held_by == "distances"
         and (f.rigidity.rigidity_class is RigidityClass.FLEXIBLE or f.rigidity.space < 3)
     }  # fmt: skip
-    forecasts = _forecasts(mission, soft)
+    forecasts = _flexibility_forecasts(mission, soft)
     for f in formations:
         if f.held_by == "nothing":
             continue
@@ -188,7 +188,7 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
                 f"solver 'exact' has no solution at '{f.name}': only {r.rank} of its {len(r.edges)} distances are"
                 " independent. Use solver = 'iterated'"
             )
-        yield from _other_shapes(mission, f, alone=alone)
+        yield from _other_shape_remarks(mission, f, alone=alone)
 
 
 def _dimension_spanned(points: Floats, *moves: Floats) -> int:
@@ -197,7 +197,7 @@ def _dimension_spanned(points: Floats, *moves: Floats) -> int:
     return distance_geometry.dimension(x)
 
 
-def _flat_start(mission: Mission) -> Iterator[Remark]:
+def _flat_start_remarks(mission: Mission) -> Iterator[Remark]:
     """Remark on agents that start on a line or in a plane, which forces along their edges cannot move them off."""
     unequal, moves = len(set(mission.agents.mass)) > 1, [centred(mission.fleet.velocity)]
     formed = turned = False
@@ -227,7 +227,7 @@ def _flat_start(mission: Mission) -> Iterator[Remark]:
         return
 
 
-def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]:
+def _flexibility_forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]:
     """What becomes of some formations that distances alone hold, if only forces along their edges move the agents.
 
     By name: the greatest dimension of the space that the agents keep to, and the greatest error of a pair at the end of
@@ -281,7 +281,7 @@ def _flexible(name: str, r: Rigidity, forecast: tuple[int, float] | None) -> Ite
     yield Remark(level, "formation", text + held)
 
 
-def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterator[Remark]:
+def _other_shape_remarks(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterator[Remark]:
     """Remarks on other shapes with the same distances, if distances alone guide the agents."""
     others = f.realisations
     if others is None or not alone:

@@ -107,7 +107,7 @@ class LinearFlight:
         self._diagonal = np.eye(most) * diagonal[:, None]
         self._coupling = self._mean * inverse[:, None, None] * (u @ u.transpose(0, 2, 1))
         self._coupling *= 1.0 - np.eye(most)
-        self._inverse = self._inverses(np.ones((self.n, most)), np.arange(self.n))
+        self._inverse = self._equation_inverses(np.ones((self.n, most)), np.arange(self.n))
 
         late, tick = lags[0].delay, radio.tick
         #: Ticks from a measurement to its use.
@@ -139,7 +139,7 @@ class LinearFlight:
         v += t * a
         return heard
 
-    def _inverses(self, grip: Floats, who: Ints) -> Floats:
+    def _equation_inverses(self, grip: Floats, who: Ints) -> Floats:
         """Inverses (K, W, W) of the equations of some vehicles, whose edges have the ``grip`` (K, W).
 
         As in `neighbours.solve_own_edges`, an edge that slips has a larger entry on the diagonal.
@@ -151,9 +151,9 @@ class LinearFlight:
         """Vehicles (K,) in flights (K,) of which an edge slips, and the inverses of their equations."""
         each = np.concatenate([grip, np.ones((1, grip.shape[1]))])[self._rows]
         who, flight = np.nonzero((each < 1.0).any(axis=1))
-        return who, flight, self._inverses(each[who, :, flight], who)
+        return who, flight, self._equation_inverses(each[who, :, flight], who)
 
-    def _solve(self, right: Floats, slipping: tuple[Ints, Ints, Floats] | None) -> Floats:
+    def _multipliers(self, right: Floats, slipping: tuple[Ints, Ints, Floats] | None) -> Floats:
         """Multipliers (L, B) by the right sides of all rows."""
         each = np.concatenate([right, np.zeros((1, right.shape[1]))])[self._rows]
         y = self._inverse @ each
@@ -203,7 +203,7 @@ class LinearFlight:
             slipping = None if grip is None else self._slipping_ends(grip)
             y, force, rest = np.zeros_like(right), 0.0, []
             for theirs in held[_REST:]:
-                y = self._solve(self._mean * (right + theirs) + self._damping * y, slipping)
+                y = self._multipliers(self._mean * (right + theirs) + self._damping * y, slipping)
                 force = pull @ y
                 # What a vehicle's other edges do to it: all of them, without the one that leads back.
                 rest.append(other @ force + self._theirs * y[self.back])
@@ -224,11 +224,11 @@ class LinearFlight:
                 z.seen[0] = np.einsum("qpn,pnb->qnb", self._early[:2], motion)
             z.orders[:] = np.einsum("qpn,pnb->qnb", self._motion, motion)
             self._extrapolate(z.held[1:], tick)
-            z.held += arrivals(k + 1, partial(self._updates, sent, k + 1, delay, z.held))
+            z.held += arrivals(k + 1, partial(self._message_updates, sent, k + 1, delay, z.held))
             squares[k] = ((self.edges @ z.orders[0]) ** 2).sum(axis=0)
         return squares, x
 
-    def _updates(self, sent: Floats, k: int, delay: int, held: Floats, late: int) -> Floats:
+    def _message_updates(self, sent: Floats, k: int, delay: int, held: Floats, late: int) -> Floats:
         """What changes in what is held (W, L, B) if each link's message arrives at tick k, some ticks late."""
         age = delay + late
         news = sent[(k - age) % len(sent)].copy()

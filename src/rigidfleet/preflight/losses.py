@@ -26,7 +26,7 @@ from rigidfleet.rigidity import analyse
 
 def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on lost links, and on the way of those left after the first loss."""
-    yield from _links(mission)
+    yield from _lost_link_remarks(mission)
     first = mission.abandons_at
     if not np.isfinite(first):
         return
@@ -41,7 +41,7 @@ def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     way, problem, _ = planned_answer(mission, at, legs)
     end = way[-1].end
     does = "hold to" if mission.on_loss == "hold" or problem else "land by"
-    stop = way[0].after.r.mean(axis=0)
+    stop = way[0].planned_end_state.r.mean(axis=0)
     place = ", ".join(f"{x:.1f}" for x in stop)
     what = "the order to abort" if ordered else f"the loss of {mission.first_lost}"
     if problem:
@@ -64,7 +64,7 @@ def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
 
 def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
     """Remarks on those left who hit a lost vehicle that falls or lies, at samples of the way after the loss."""
-    left, radius = aborts.left, aborts.radius[aborts.left] - aborts.astray.max()
+    left, radius = aborts.left, aborts.radius[aborts.left] - aborts.fall_uncertainty.max()
     for planned in way if aborts.wrecks else ():
         r, time = planned.position[:, left], planned.time
         room, near = proximity.obstacle_clearances(r, radius, aborts.wrecks, time)
@@ -83,7 +83,7 @@ def planned_answer(mission: Mission, at: Leg, legs: Sequence[Leg]) -> Answer:
     return answer_to(mission, now, lambda: legs)
 
 
-def _links(mission: Mission) -> Iterator[Remark]:
+def _lost_link_remarks(mission: Mission) -> Iterator[Remark]:
     """Remarks on the rigidity of each formation without the edges of lost links."""
     pairs, times = mission.links_lost
     if not len(pairs):

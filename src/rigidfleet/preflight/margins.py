@@ -16,7 +16,7 @@ from rigidfleet.math.margins import (
     Margins,
     formation_loops,
     largest_pole,
-    margins,
+    stability_margins,
     tracking_loops,
 )
 from rigidfleet.mission import Mission, Phase
@@ -45,16 +45,16 @@ def check_margins(
     way : the planned phases
     lags : of each vehicle
     """
-    tracking = tracking_law(mission, lags)
-    laws, skipped = formation_laws(mission, way, lags)
+    tracking = tracking_closed_loops(mission, lags)
+    laws, skipped = formation_closed_loops(mission, way, lags)
     by_place: dict[str, FormationMargins] = {}
     for where, loops, law, growth in laws:
         known, pole = by_place.get(where, _UNBOUNDED)
-        now = known.smaller_margins(margins(loops, law, growth))
+        now = known.smaller_margins(stability_margins(loops, law, growth))
         if constrained := [loop for loop in loops if loop.is_constrained]:
             pole = largest_pole(constrained, law, pole, growth)
         by_place[where] = FormationMargins(now, pole)
-    alone = None if tracking is None else margins(tracking.loops, tracking.law)
+    alone = None if tracking is None else stability_margins(tracking.loops, tracking.law)
     return MarginsCheck(alone, by_place, skipped)
 
 
@@ -75,14 +75,14 @@ class ClosedLoops(NamedTuple):
     growth: float
 
 
-def tracking_law(mission: Mission, lags: Sequence[Lag]) -> ClosedLoops | None:
+def tracking_closed_loops(mission: Mission, lags: Sequence[Lag]) -> ClosedLoops | None:
     """The tracking of single vehicles; None if no phase tracks slots."""
     if not any(phase.control == "tracking" for phase in mission.phases):
         return None
     return ClosedLoops("tracking", tracking_loops(lags), phase_gains(mission, None, None), GROWTH)
 
 
-def formation_laws(
+def formation_closed_loops(
     mission: Mission, way: Sequence[PlannedPhase], lags: Sequence[Lag]
 ) -> tuple[list[ClosedLoops], bool]:
     """The loops of each formation and of the ways between them, and whether some were left out to limit the work."""

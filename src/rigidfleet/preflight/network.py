@@ -68,7 +68,7 @@ def check_network(
         delay, growing = last_stable_delay(flight), None
         loss = greatest_stable_loss(flight) if radio.delay <= delay else None
         if latest > min(radio.delay, delay) or own.burst is not None or own.loss > (loss or 0.0):
-            growing = float((sampled_growth(flight, net, every) > _GROWS).mean())
+            growing = float((growth_in_network(flight, net, every) > _GROWS).mean())
         check = FormationNetwork(
             flight.n / (radio.every * radio.tick), radio.tick, delay, latest, loss, own.loss, growing, unheard
         )  # fmt: skip
@@ -230,7 +230,7 @@ def greatest_stable_loss(flight: LinearFlight) -> float:
     return stable / 100
 
 
-def sampled_growth(flight: LinearFlight, net: Links, every: int) -> Floats:
+def growth_in_network(flight: LinearFlight, net: Links, every: int) -> Floats:
     """Growth [1/s] of the errors of edges in some flights (B,) with the losses, jitter and time-outs of a network."""
     rng, delay, L = np.random.default_rng(0), flight.radio.delay, len(flight.links)
     late = math.ceil((net.delay + net.jitter) / every) - delay

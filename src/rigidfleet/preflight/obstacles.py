@@ -14,7 +14,7 @@ from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_word
 from rigidfleet.planning.clearance import CLOSE, closest, speed_bounds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import SLACK, Preflight, Remark, names_in_words
-from rigidfleet.solids.records import extent
+from rigidfleet.solids.records import swept_extent
 from rigidfleet.typing import Floats
 
 #: Maximum number of comparisons of agent positions with obstacles; one of a phase with an obstacle counts as so many.
@@ -73,7 +73,7 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             verb = "hits" if exact else "may hit"
             text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s in '{phase}'"
             if isinstance(thing, Ground):
-                text += _too_low(mission, preflight, phase, thing.height)
+                text += _too_low_in_words(mission, preflight, phase, thing.height)
             evaded = thing.solid.moves and is_left_to_avoidance(mission, "obstacle")
             if evaded:
                 text += " as planned; [avoidance] has to evade it"
@@ -89,7 +89,7 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
         names = [mission.obstacles[b].name for b in sorted(skipped)]
         text = f"to limit the time of the check, {names_in_words(names)} skipped"
         yield Remark("note", "obstacle", text)
-    yield from _gaps(mission, preflight, radius)
+    yield from _gap_remarks(mission, preflight, radius)
 
 
 def boundary_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -120,12 +120,12 @@ def _distance_bound(within: Floats, thing: Obstacle) -> Floats:
 
     Minus infinity where a box overlaps the obstacle's extent: how deep it reaches into the obstacle is not known.
     """
-    low, high = extent(thing.solid)
+    low, high = swept_extent(thing.solid)
     apart = np.maximum(np.maximum(within[:, 0] - high, low - within[:, 1]), 0.0)
     return np.where(apart.any(axis=1), np.linalg.norm(apart, axis=1), -np.inf)
 
 
-def _too_low(mission: Mission, preflight: Preflight, phase: str, ground: float) -> str:
+def _too_low_in_words(mission: Mission, preflight: Preflight, phase: str, ground: float) -> str:
     """Why a vehicle touches the ground [m] in a phase, and the altitude that its formation needs."""
     planned = next(planned for planned in preflight.planned_phases if planned.phase == phase)
     masses, radius = mission.fleet.mass, mission.fleet.radius
@@ -141,7 +141,7 @@ def _too_low(mission: Mission, preflight: Preflight, phase: str, ground: float) 
     )
 
 
-def _gaps(mission: Mission, preflight: Preflight, radius: Floats) -> Iterator[Remark]:
+def _gap_remarks(mission: Mission, preflight: Preflight, radius: Floats) -> Iterator[Remark]:
     """Remarks on gaps between two boxes along the axes, at rest, through which the centre of mass passes.
 
     A gap lies between the nearest boxes on both sides of the centre of mass along an axis.

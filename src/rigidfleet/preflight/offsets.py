@@ -16,7 +16,7 @@ import numpy as np
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, rigid_body
-from rigidfleet.math.margins import input_shares
+from rigidfleet.math.margins import constraint_share_of_input
 from rigidfleet.math.pid import exponential
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import PlannedPhase
@@ -39,7 +39,7 @@ _SHAPES = 16
 _SMALL = 0.05
 
 
-def offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
+def slot_offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
     """Offsets (K, N, 3) [m] of the vehicles from their slots in each planned phase; zeros where none are tracked."""
     tracked = [planned.leg.phase.control == "tracking" for planned in way]
     pushes = [
@@ -89,7 +89,7 @@ def _offsets_with_edges(
 ) -> Floats:
     """Offsets (K, N, 3) of the tracking (K, 0, 3N), but of the constraint law (K, 1, 3N) in what edges hold."""
     free = answers[:, 0].reshape(pushed.shape)
-    name, masses = planned.leg.after.formation, mission.fleet.mass
+    name, masses = planned.leg.planned_end_state.formation, mission.fleet.mass
     if name is None or np.ptp(pushed, axis=1).max() < 1e-9:
         return free
     edges = mission.formation_edges(name)
@@ -98,7 +98,7 @@ def _offsets_with_edges(
     law, root = phase_gains(mission, planned.leg.phase, name), np.repeat(np.sqrt(masses), 3)
     law = replace(law, damping=_SMALL * law.damping)
     for part in np.array_split(np.arange(len(free)), _SHAPES):
-        S = input_shares(planned.position[part[len(part) // 2]], edges, masses, law)
+        S = constraint_share_of_input(planned.position[part[len(part) // 2]], edges, masses, law)
         mixed = answers[part, 0] + (answers[part, 1] - answers[part, 0]) * root @ S / root
         free[part] = mixed.reshape(-1, *free.shape[1:])
     return free
@@ -116,7 +116,7 @@ def offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     way, remedy = preflight.planned_phases, ""
     if not mission.tracking.integral:
         remedy = f"; tracking has no integral: raise the first weight in tracking.Q (now {mission.tracking.Q[0]:g})"
-    for planned, off in zip(way, offsets(mission, way), strict=True):
+    for planned, off in zip(way, slot_offsets(mission, way), strict=True):
         far = float(np.linalg.norm(off, axis=2).max())
         if planned.leg.end > mission.first_loss or far < _LEAST:
             continue
@@ -164,16 +164,16 @@ def _broken_limits(
         )
     for place, k in places:
         by = float(np.linalg.norm(masses @ off[k]) / masses.sum())
-        by = by if leg.after.formation else max(by, float(far[k].max()))
+        by = by if leg.planned_end_state.formation else max(by, float(far[k].max()))
         held.append(("waypoint", place, by, WAYPOINT_TOLERANCE["position"]))
     forms, turns = phase.establishing is not None, "attitude" in phase.meets
-    lies, goal = forms and not mission.free_attitude(phase), leg.after.goal
+    lies, goal = forms and not mission.free_attitude(phase), leg.planned_end_state.goal
     kept = stays and not forms and goal is not None and goal.named
     for k in [arrival] * (lies or turns) + [-1] * (later if turns else kept):
         turn = rigid_body.kabsch(r[k], planned.position[k], masses, near=np.eye(3))
         by = float(np.degrees(np.linalg.norm(att.rotation_vector_from_dcm(turn))))
         held.append(("attitude", "", by, WAYPOINT_TOLERANCE["attitude"]))
-    last, name = planned is preflight.planned_phases[-1], leg.after.formation
+    last, name = planned is preflight.planned_phases[-1], leg.planned_end_state.formation
     if name and (phase.shaping is not None or last) and 1 < len(masses) <= STACKED:
         # To first order: a turn of the whole changes no distance.
         i, j = proximity.all_pairs(len(masses))

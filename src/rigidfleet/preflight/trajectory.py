@@ -14,9 +14,9 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
 from rigidfleet.mission import Mission
-from rigidfleet.mission.disturbances import intensity
+from rigidfleet.mission.disturbances import gust_intensity
 from rigidfleet.planning import timing
-from rigidfleet.planning.certificate import straight
+from rigidfleet.planning.certificate import of_blend
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.limits import limits_of
 from rigidfleet.planning.preview import PlannedPhase
@@ -53,7 +53,7 @@ def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         if bent and (proved := planned.certificate) is not None:
             ends = [proved[:3]]
         if planned.path_ends is not None:
-            certificate = planned.certificate or straight(planned.leg.reference, radius)
+            certificate = planned.certificate or of_blend(planned.leg.reference, radius)
             assert certificate is not None  # there are two agents
             crossing, separation = certificate[:3], certificate.separation
             least = min(least, crossing)
@@ -173,7 +173,7 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
     wind, up = np.array(d.wind), np.array([0.0, 0.0, 1.0])
     g, speed = mission.gravity, float(np.linalg.norm(d.wind))
     k1, k2 = mission.tracking_gains
-    sigma = 0.0 if d.gusts is None else float(intensity(d.gusts, speed).max())
+    sigma = 0.0 if d.gusts is None else float(gust_intensity(d.gusts, speed).max())
     gusts = 3 * sigma * drag
     noise = np.zeros(len(believed))
     if d.noise is not None:
@@ -240,7 +240,7 @@ def waypoint_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
     begun = True  # whether the phase begins when and where it is planned
     for planned in preflight.planned_phases:
         leg = planned.leg
-        phase, goal, exact = leg.phase, leg.after.goal, begun
+        phase, goal, exact = leg.phase, leg.planned_end_state.goal, begun
         begun = begun and phase.settle is None
         if phase.control == "open" or goal is None or leg.arrival > leg.end:
             continue
@@ -290,7 +290,7 @@ def limit_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
                     remedy = f"the least {key} of this phase is {math.ceil(100 * t) / 100:.2f} s"
                 yield Remark("fails", topic, f"{timing.reached_in_words(over[0], phase)}; {remedy}")
         else:
-            yield from _limits_at_samples(mission, planned)
+            yield from _sample_limit_remarks(mission, planned)
         yield from geofence_remarks(mission, planned)
 
 
@@ -306,7 +306,7 @@ def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark
             yield Remark("fails" if planned.exact else "note", "geofence", text)
 
 
-def _limits_at_samples(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
+def _sample_limit_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
     """Remarks on speed, acceleration and thrust of samples beyond their limits."""
     x = np.stack([planned.position, planned.velocity, planned.acceleration], axis=1)
     for limit in limits_of(mission):

@@ -17,7 +17,7 @@ from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.vehicles import (
     air_force,
     commanded_yaw,
-    first_yaw,
+    initial_yaw,
     jet_speeds,
     slots_and_yaw,
     turn_along,
@@ -47,7 +47,7 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
     tracked = [planned for planned in way if planned.leg.phase.control == "tracking"]
     if models is None or not tracked or all(model.point for model in models):
         return None
-    setting, angle, needs = commanded_yaw(mission), first_yaw(mission), []
+    setting, angle, needs = commanded_yaw(mission), initial_yaw(mission), []
     for planned in tracked:
         leg, n = planned.leg, mission.n_agents
         count = min(max(_SAMPLES, int((leg.end - leg.start) / _STEP) + 1), _MOST)
@@ -60,7 +60,7 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
             if not model.point:
                 need = _needs_of_path(model, x[:, :, i], yaw[:, :, i], mission.gravity)
                 needs.append(_needs_of_phase(model, need, time, f"agent {i + 1}", planned.phase))
-    jump = _greatest_jump(mission, tracked)
+    jump = _greatest_acceleration_jump(mission, tracked)
     return VehicleCheck(
         rotor_force=max((x.rotor_force for x in needs), key=lambda force: force[0] / force[3]),
         tilt=max((x.tilt for x in needs), key=lambda tilt: tilt[0]),
@@ -103,7 +103,7 @@ def _needs_of_path(model: VehicleModel, x: Floats, yaw: Floats, g: float) -> Fla
     return flat(force, yaw)
 
 
-def _greatest_jump(
+def _greatest_acceleration_jump(
     mission: Mission, way: Sequence[PlannedPhase]
 ) -> tuple[float, float, float, str] | None:
     """The greatest jump of the reference's acceleration [m/s^2], of the tilt [deg], its time [s], and the phase."""

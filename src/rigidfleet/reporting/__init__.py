@@ -21,7 +21,7 @@ from rigidfleet.result import Result, as_result
 if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
 
-__all__ = ["html_page", "report"]
+__all__ = ["report", "report_page"]
 
 
 def report(
@@ -53,11 +53,11 @@ def report(
         ``results`` holds what is neither a flight nor a path.
     """
     target = as_path(path)
-    page = html_page(results, labels=labels, verdicts=verdicts, rehearsed=rehearsed, abort=abort)
+    page = report_page(results, labels=labels, verdicts=verdicts, rehearsed=rehearsed, abort=abort)
     write_file(target, page.encode())
 
 
-def html_page(
+def report_page(
     results: Result | str | Path | Sequence[Result | str | Path],
     *,
     labels: Sequence[str] | None = None,
@@ -66,7 +66,7 @@ def html_page(
 ) -> str:
     """The page that `report` writes; ``beside`` are what was rehearsed, and how the flight is aborted."""
     from rigidfleet._common.templates import templates
-    from rigidfleet.reporting.contents import contents
+    from rigidfleet.reporting.contents import page_contents
     from rigidfleet.web.policy import content_policy
 
     if isinstance(results, Result | str | Path):
@@ -77,7 +77,7 @@ def html_page(
     environment = templates("rigidfleet.reporting")
     style = environment.get_template("style.css").render()
     return environment.get_template("page.html").render(
-        contents(flights, labels, verdicts, **beside),
+        page_contents(flights, labels, verdicts, **beside),
         policy=content_policy(style=style),
         style=style,
     )

@@ -26,7 +26,7 @@ def brief_rows(
 
     Parameters
     ----------
-    falls : where vehicles fall (K, N, 2) [m], by `areas.falls_of`
+    falls : where vehicles fall (K, N, 2) [m], by `areas.fall_places_by_sample`
     rehearsed : what drills have shown, in sentences
     abort : how the flight is aborted
     """
@@ -35,12 +35,12 @@ def brief_rows(
     ]
     return [
         ("Planned", plan_sentences(result)),
-        ("Proved", _proofs(result, verdict)),
+        ("Proved", _proof_sentences(result, verdict)),
         ("Rehearsed", rehearsed or ["No drill belongs to this report."]),
         ("Aborted", abort or ["No way home belongs to this report."]),
         ("Fences and people", beside or ["The mission has neither."]),
-        ("Where things fall", _falls(result, falls)),
-        ("Versions and digests", digests(result)),
+        ("Where things fall", _fall_sentences(result, falls)),
+        ("Versions and digests", digest_sentences(result)),
     ]
 
 
@@ -65,7 +65,7 @@ def plan_sentences(result: Result) -> list[str]:
     return [f"{number} for {lasting}{how}.", f"{ends}."]
 
 
-def _proofs(result: Result, verdict: Verdict) -> list[str]:
+def _proof_sentences(result: Result, verdict: Verdict) -> list[str]:
     """The least of the plan's certificates, and how many checks of the flight are judged at all times."""
     judged = [check.at_samples for check in verdict.checks if check.judged]
     known = f"{judged.count(False)} of {len(judged)} checks are judged at all times, not at samples alone."
@@ -80,7 +80,7 @@ def _proofs(result: Result, verdict: Verdict) -> list[str]:
     ]
 
 
-def _falls(result: Result, falls: Floats) -> list[str]:
+def _fall_sentences(result: Result, falls: Floats) -> list[str]:
     """How far vehicles that fail are carried, at samples."""
     mission = result.mission
     if not np.isfinite(falls).any():
@@ -100,7 +100,7 @@ def _falls(result: Result, falls: Floats) -> list[str]:
     ]
 
 
-def digests(result: Result) -> list[str]:
+def digest_sentences(result: Result) -> list[str]:
     """Versions, what the flight took to compute, and digests of its mission, of files and of what was flown."""
     versions = ", ".join(f"{name} {version}" for name, version in result.versions.items())
     states = sha256(np.ascontiguousarray(result.position).tobytes()).hexdigest()

@@ -17,7 +17,7 @@ from rigidfleet._common.text import all_hold_in_words
 from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
 from rigidfleet.plotting import encode_figure
-from rigidfleet.plotting.areas import falls_of, sketch
+from rigidfleet.plotting.areas import draw_ground, fall_places_by_sample
 from rigidfleet.plotting.quadrotors import (
     has_rotors,
     rotor_forces,
@@ -39,7 +39,7 @@ _VEHICLES = 24
 _KEYS = 40
 
 
-def contents(
+def page_contents(
     flights: Sequence[Result],
     labels: Sequence[str] | None,
     verdicts: Sequence[Verdict] | None,
@@ -61,16 +61,16 @@ def contents(
     missions = [flight.mission for flight in flights]
     several = len(flights) > 1
     colours = plotting.agent_colours(len(flights))
-    pages = [_flight(*each) for each in zip(flights, judged, names, colours, strict=True)]
+    pages = [_flight_data(*each) for each in zip(flights, judged, names, colours, strict=True)]
     # Trajectories that others made have no gains.
     controlled = any(each["gains"] is not None and each["gains"].rows for each in pages)
     # The summary has its own page.
     drawn = [name for name in plotting.figure_names(flights[0]) if name != "summary"]
     first: dict[str, Any] = {"brief": [], "sketch": None}
     if not several:
-        falls = falls_of(flights[0])
+        falls = fall_places_by_sample(flights[0])
         first["brief"] = brief.brief_rows(flights[0], judged[0], falls, **more)
-        first["sketch"] = _data_url(encode_figure(sketch(flights[0], falls), ["svg"])["svg"])
+        first["sketch"] = _data_url(encode_figure(draw_ground(flights[0], falls), ["svg"])["svg"])
     return {
         "title": " · ".join(names),
         "several": several,
@@ -100,7 +100,7 @@ def _names_of(flights: Sequence[Result]) -> list[str]:
 # -- one flight --------------------------------------------------------------------------------------
 
 
-def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[str, Any]:
+def _flight_data(result: Result, verdict: Verdict, label: str, colour: str) -> dict[str, Any]:
     mission = result.mission
     judged = [check for check in verdict.checks if check.judged]
     failed = verdict.failures or verdict.open_checks
@@ -125,7 +125,7 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
         "summary": _figure(result, "summary"),
         "gains": _gains_table(result),
-        "digests": brief.digests(result),
+        "digests": brief.digest_sentences(result),
         "text": result.mission_text,
     }
 
@@ -157,33 +157,33 @@ def _vehicles_table(result: Result) -> FactTable:
     """Extremes of each vehicle; if there are too many, of those with the greatest thrust."""
     n, mission = result.n_agents, result.mission
 
-    def greatest(values: Floats) -> list[float | None]:
+    def greatest_of_each(values: Floats) -> list[float | None]:
         most = np.fmax.reduce(values.reshape(*values.shape[:2], -1), axis=(0, 2), initial=np.nan)
         return [x if math.isfinite(x) else None for x in most.tolist()]
 
-    def of(name: str) -> list[float | None]:
-        return greatest(samples(result, name).values)
+    def greatest_by_name(name: str) -> list[float | None]:
+        return greatest_of_each(samples(result, name).values)
 
-    def share(values: Floats, limits: Any) -> list[str]:
-        return ["" if x is None else f"{100 * x:.0f} %" for x in greatest(values / limits)]
+    def share_of_limit(values: Floats, limits: Any) -> list[str]:
+        return ["" if x is None else f"{100 * x:.0f} %" for x in greatest_of_each(values / limits)]
 
     z = result.position[..., 2]
-    thrust, nothing = of("thrust"), [None] * n
+    thrust, nothing = greatest_by_name("thrust"), [None] * n
     own, rotors = result.interpolation is None, has_rotors(result)
     columns = {
         "mass [kg]": [f"{m:.4g}" for m in mission.agents.mass] if own else nothing,
         "thrust [N]": thrust if own else nothing,
-        "share of limit": share(result.thrust[..., None], np.array(mission.agents.thrust_limit)[:, None])
+        "share of limit": share_of_limit(result.thrust[..., None], np.array(mission.agents.thrust_limit)[:, None])
         if np.isfinite(mission.agents.thrust_limit).any() else nothing,
-        "speed [m/s]": of("speed"),
-        "acceleration [m/s²]": of("acceleration"),
-        "lowest [m]": [-x for x in greatest(-z) if x is not None],
-        "highest [m]": greatest(z),
+        "speed [m/s]": greatest_by_name("speed"),
+        "acceleration [m/s²]": greatest_by_name("acceleration"),
+        "lowest [m]": [-x for x in greatest_of_each(-z) if x is not None],
+        "highest [m]": greatest_of_each(z),
         "path length [m]": np.linalg.norm(np.diff(result.position, axis=0), axis=2).sum(axis=0).tolist(),
-        "share of rotor limit": share(rotor_forces(result), rotor_limits(mission)[..., None])
+        "share of rotor limit": share_of_limit(rotor_forces(result), rotor_limits(mission)[..., None])
         if rotors else nothing,
-        "tilt [deg]": greatest(tilt(result)) if rotors else nothing,
-        "from the slot [m]": of("tracking_error") if rotors else nothing,
+        "tilt [deg]": greatest_of_each(tilt(result)) if rotors else nothing,
+        "from the slot [m]": greatest_by_name("tracking_error") if rotors else nothing,
     }  # fmt: skip
     order = np.argsort(-np.nan_to_num(np.array(thrust, dtype=float)))
     shown = np.arange(n) if n <= _VEHICLES else np.sort(order[:_VEHICLES])
@@ -208,7 +208,7 @@ def _safety_table(
     names = {row.quantity: Cell(row.quantity, row.text) for c in columns for row in c.values()}
     if len(flights) == 1:
         rows = [
-            Row((names[row.quantity], *_safety_cells(row)), _level(row))
+            Row((names[row.quantity], *_safety_cells(row)), _safety_level(row))
             for row in columns[0].values()
         ]
         heads = ("quantity", "limit", "worst", "margin", "when", "who")
@@ -220,7 +220,7 @@ def _safety_table(
     return FactTable(("quantity", *labels), rows, labels)
 
 
-def _level(row: Safety) -> Level:
+def _safety_level(row: Safety) -> Level:
     if row.undecided:
         return "undecided"
     return "" if row.limit is None else "ok" if row.passed else "fails"
@@ -249,7 +249,7 @@ def _safety_cell(name: str, row: Safety | None) -> Cell:
         return Cell(_words_for_nothing(name))
     limit, worst, _, when, who = _safety_cells(row)
     small = ", ".join(str(x) for x in (limit, who, getattr(when, "text", "")) if x)
-    return Cell(str(worst), small, level=_level(row))
+    return Cell(str(worst), small, level=_safety_level(row))
 
 
 # -- what differs ------------------------------------------------------------------------------------

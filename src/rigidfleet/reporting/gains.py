@@ -35,7 +35,7 @@ def _constraint_lines(mission: Mission) -> list[GainLine]:
         lines.append(("constraint force", "no feedback", "distance errors remain and grow"))
     else:
         gain = f"α = {c.alpha:.4g} /s, β = {c.beta:.4g} /s, γ = {c.gamma:.4g} /s³"
-        poles = ", ".join(_pole(s) for s in pid.poles(c.alpha, c.beta, c.gamma))
+        poles = ", ".join(_pole_text(s) for s in pid.poles(c.alpha, c.beta, c.gamma))
         lines += [
             ("constraint feedback", gain, "a distance error c obeys c‴ + 2α c″ + β² c′ + γ c = 0"),
             ("poles of the error", f"{poles} /s", "all have negative real parts: every error decays"),
@@ -52,7 +52,7 @@ def _constraint_lines(mission: Mission) -> list[GainLine]:
                 ("overshoot", f"{beyond:.3g} %", f"an error passes zero by this share: {why}"),
             ]
     setting = {
-        "iterated": f"μ = {_damping(mission)}, {c.iterations} iterations",
+        "iterated": f"μ = {_damping_in_words(mission)}, {c.iterations} iterations",
         "spectral": f"s₀ = {c.threshold:g}",
         "exact": "",
         "pinv": f"cut-off at {c.cutoff:g} of the largest w",
@@ -66,7 +66,7 @@ def _constraint_lines(mission: Mission) -> list[GainLine]:
     return lines
 
 
-def _damping(mission: Mission) -> str:
+def _damping_in_words(mission: Mission) -> str:
     """Damping of the iterated solve; its range over all formations if it depends on them."""
     every = [mission.damping(name) for name in mission.formations] or [mission.damping(None)]
     low, high = f"{min(every):.2g}", f"{max(every):.2g}"
@@ -78,7 +78,7 @@ def _tracking_lines(mission: Mission) -> list[GainLine]:
         return []
     t = mission.tracking
     k1, k2 = lqr.double_integrator_gains(t.Q, t.R)
-    meaning = f"each vehicle follows its slot: {_second_order(k1, k2)}"
+    meaning = f"each vehicle follows its slot: {_behaviour_in_words(k1, k2)}"
     return [("tracking", f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s", meaning)]
 
 
@@ -93,8 +93,8 @@ def _regulator_line(name: str, regulator: Regulator) -> GainLine:
     if regulator.horizon == "infinite":
         k1, k2 = lqr.double_integrator_gains(regulator.Q, regulator.R)
         value = f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s"
-        return (f"{name}, infinite horizon", value, _second_order(k1, k2))
-    q, r, s = (_weights(w) for w in (regulator.Q, (regulator.R,), regulator.S))
+        return (f"{name}, infinite horizon", value, _behaviour_in_words(k1, k2))
+    q, r, s = (_weights_text(w) for w in (regulator.Q, (regulator.R,), regulator.S))
     meaning = "gains rise towards arrival, where S weighs errors of position and velocity"
     if not any(regulator.Q):
         meaning = (
@@ -103,7 +103,7 @@ def _regulator_line(name: str, regulator: Regulator) -> GainLine:
     return (f"{name}, finite horizon", f"Q = {q}, R = {r}, S = {s}", meaning)
 
 
-def _second_order(k1: float, k2: float) -> str:
+def _behaviour_in_words(k1: float, k2: float) -> str:
     """Behaviour of x'' = -k1 x - k2 x' in words."""
     omega = math.sqrt(k1)
     zeta = k2 / (2 * omega)
@@ -114,12 +114,12 @@ def _second_order(k1: float, k2: float) -> str:
     )
 
 
-def _pole(s: complex) -> str:
+def _pole_text(s: complex) -> str:
     if abs(s.imag) < 1e-9 * abs(s):
         return f"{s.real:.3g}"
     return f"{s.real:.3g} {'+' if s.imag > 0 else '−'} {abs(s.imag):.3g}i"
 
 
-def _weights(values: tuple[float, ...]) -> str:
+def _weights_text(values: tuple[float, ...]) -> str:
     text = ", ".join(f"{v:g}" for v in values)
     return text if len(values) == 1 else f"diag({text})"

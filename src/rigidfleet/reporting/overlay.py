@@ -25,15 +25,15 @@ def draw_paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
     with st.apply_style():
         fig = st.blank_figure(st.WIDTH, 3.6, "constrained")
         above, height = fig.subplots(1, 2)
-        for flight, look in zip(flights, _looks(flights), strict=True):
+        for flight, look in zip(flights, _line_looks(flights), strict=True):
             above.plot(flight.cm[:, 0], flight.cm[:, 1], **look)
             height.plot(flight.time, flight.cm[:, 2], **look)
         above.set(xlabel="x, east [m]", ylabel="y, north [m]", title="centre of mass from above")
         above.set_aspect("equal", adjustable="datalim")
         above.margins(0.05)
         height.set(xlabel="time [s]", ylabel="z [m]", title="height of the centre of mass")
-        _key(fig, flights, labels)
-        return _svg(fig)
+        _add_flights_legend(fig, flights, labels)
+        return _svg_of_figure(fig)
 
 
 def draw_over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
@@ -47,7 +47,7 @@ def draw_over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
         axes = fig.subplots(rows, 2, sharex=True, squeeze=False).ravel()
         for ax, name in zip(axes, panels, strict=False):
             known = False
-            for flight, look in zip(flights, _looks(flights), strict=True):
+            for flight, look in zip(flights, _line_looks(flights), strict=True):
                 values = samples(flight, name).worst
                 ax.plot(flight.time, values, **look)
                 known |= bool(np.isfinite(values).any())
@@ -66,22 +66,22 @@ def draw_over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
         for ax in axes[len(panels) - 2 : len(panels)]:
             ax.set_xlabel("time [s]")
             ax.tick_params(labelbottom=True)
-        _key(fig, flights, labels)
-        return _svg(fig)
+        _add_flights_legend(fig, flights, labels)
+        return _svg_of_figure(fig)
 
 
-def _looks(flights: Sequence[Result]) -> list[dict[str, Any]]:
+def _line_looks(flights: Sequence[Result]) -> list[dict[str, Any]]:
     """Colour and width of each flight's lines."""
     widths = np.linspace(*_WIDTHS, len(flights)) if len(flights) > 1 else [1.6]
     colours = st.agent_colours(len(flights))
     return [{"color": c, "linewidth": float(w)} for c, w in zip(colours, widths, strict=True)]
 
 
-def _key(fig: Figure, flights: Sequence[Result], labels: Sequence[str]) -> None:
-    looks = zip(labels, _looks(flights), strict=True)
+def _add_flights_legend(fig: Figure, flights: Sequence[Result], labels: Sequence[str]) -> None:
+    looks = zip(labels, _line_looks(flights), strict=True)
     handles = [st.legend_entry(st.clean_name(label), **look) for label, look in looks]
     fig.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4))
 
 
-def _svg(fig: Figure) -> bytes:
+def _svg_of_figure(fig: Figure) -> bytes:
     return encode_figure(fig, ["svg"])["svg"]

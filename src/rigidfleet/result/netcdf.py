@@ -79,7 +79,7 @@ _MARK = "rigidfleet_schema_version"
 _CHUNK = 1 << 20
 
 
-def file_content(
+def netcdf_content(
     variables: Mapping[str, Variable],
     arrays: Mapping[str, NDArray[Any]],
     edges: Sequence[str],
@@ -126,7 +126,7 @@ def file_content(
                 variable.dims,
                 "i4" if variable.integers else "f8",
                 data=value,
-                chunks=_chunks(value.shape),
+                chunks=_chunk_shape(value.shape),
                 fletcher32=True,  # detects damage; compression would save a seventh of the size and double the time
             )
             entry.attrs["units"] = variable.units
@@ -134,7 +134,7 @@ def file_content(
     return buffer.getvalue()
 
 
-def read_file(path: Path, variables: Mapping[str, Variable]) -> dict[str, Any]:
+def read_netcdf(path: Path, variables: Mapping[str, Variable]) -> dict[str, Any]:
     """Read the arrays and attributes of a file by name, checked against their declarations.
 
     Raises
@@ -146,7 +146,7 @@ def read_file(path: Path, variables: Mapping[str, Variable]) -> dict[str, Any]:
     """
     from rigidfleet._common import reader
 
-    data = _bytes(path)
+    data = _read_result_bytes(path)
     due = {name: reader.Array(v.dims, v.integers, v.optional) for name, v in variables.items()}
     with reader.open_hdf5(data) as file:
         if _MARK not in file.attrs:
@@ -170,7 +170,7 @@ def _attribute_name(name: str) -> str:
     return "mission" if name == "mission_text" else name
 
 
-def _chunks(shape: tuple[int, ...]) -> tuple[int, ...] | None:
+def _chunk_shape(shape: tuple[int, ...]) -> tuple[int, ...] | None:
     """Shape of a chunk: as many whole rows as fit into `_CHUNK`; None for an empty array."""
     if 0 in shape:
         return None
@@ -178,7 +178,7 @@ def _chunks(shape: tuple[int, ...]) -> tuple[int, ...] | None:
     return (min(shape[0], max(1, _CHUNK // row)), *shape[1:])
 
 
-def _bytes(path: Path) -> bytes:
+def _read_result_bytes(path: Path) -> bytes:
     try:
         data = path.read_bytes()
     except FileNotFoundError as error:

@@ -60,7 +60,7 @@ def owner_name(result: Result, q: Quantity, who: int, other: int = -1) -> str:
     return f"agent {who + 1}" if q.who == "agent" else ""
 
 
-def without_lost(result: Result, values: Floats) -> Floats:
+def mask_lost(result: Result, values: Floats) -> Floats:
     """Values (K, N), NaN for lost agents."""
     return values if result.left.all() else np.where(result.left, values, np.nan)
 
@@ -84,12 +84,12 @@ def samples(result: Result, name: str, close: proximity.Closeness | None = None)
     return Samples(QUANTITIES[name], *SAMPLED[name](result))
 
 
-def _motion(result: Result, q: Quantity) -> tuple[Floats, ...]:
+def _motion_sizes(result: Result, q: Quantity) -> tuple[Floats, ...]:
     """Sizes (K, N) of velocity, acceleration or the jerk of slots, in all directions or one."""
     x = getattr(result, ("velocity", "acceleration", "slot_jerk")[q.order - 1])
     if x is None:
         return (np.full(result.left.shape, np.nan),)
-    return (without_lost(result, SIZES[q.way](x) if q.way else norms(x)),)
+    return (mask_lost(result, SIZES[q.way](x) if q.way else norms(x)),)
 
 
 def _headroom(result: Result) -> tuple[Floats, Owner]:
@@ -119,17 +119,17 @@ def _beyond_fence(result: Result) -> tuple[Floats, ...]:
     r, fence = result.position, result.mission.limits.geofence
     if fence is None:
         return (np.full(result.left.shape, np.nan),)
-    return (without_lost(result, np.maximum(fence.min - r, r - fence.max).max(axis=2)),)
+    return (mask_lost(result, np.maximum(fence.min - r, r - fence.max).max(axis=2)),)
 
 
-def _boundary(result: Result, name: str) -> tuple[Any, ...]:
+def _boundary_distances(result: Result, name: str) -> tuple[Any, ...]:
     """Distance (K, N) [m] beyond a fence, or of where a fall ends from people."""
     from rigidfleet.mission.boundaries import Boundaries, areas_of  # takes long to load
 
     if not areas_of(result.mission, name):
         return (np.full(result.left.shape, np.nan),)
     values, number = Boundaries(result.mission).values(name, result.position, result.velocity)
-    return without_lost(result, values), lambda k, i: (i, int(number[k, i]))
+    return mask_lost(result, values), lambda k, i: (i, int(number[k, i]))
 
 
 def _tilt(result: Result) -> tuple[Floats, ...]:
@@ -141,7 +141,7 @@ def _tilt(result: Result) -> tuple[Floats, ...]:
         up = force[..., 2] / np.maximum(norms(force), 1e-300)
     else:
         up = np.full(result.left.shape, np.nan)
-    return (without_lost(result, np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),)
+    return (mask_lost(result, np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),)
 
 
 def _thrust(result: Result) -> tuple[Floats, ...]:
@@ -151,27 +151,27 @@ def _thrust(result: Result) -> tuple[Floats, ...]:
         thrust = np.minimum(thrust, agents.thrust_limit)
     if result.rotor_force is not None:  # what was given, not what was asked
         thrust = result.rotor_force.sum(axis=2)
-    return (without_lost(result, np.maximum(thrust, result.thrust)),)
+    return (mask_lost(result, np.maximum(thrust, result.thrust)),)
 
 
-def _of_edges(result: Result, values: Floats) -> tuple[Floats, Owner]:
+def _with_edge_owners(result: Result, values: Floats) -> tuple[Floats, Owner]:
     edges = result.edges
     return values, lambda _k, e: edges[e].tolist()
 
 
 #: Values of quantities at samples, with their owners where these are no single agents.
 SAMPLED: dict[str, Callable[[Result], tuple[Any, ...]]] = {
-    **{q.name: partial(_motion, q=q) for q in MOTIONS},
+    **{q.name: partial(_motion_sizes, q=q) for q in MOTIONS},
     "separation_below": _headroom,
     "lost": _distance_to_lost,
     "geofence": _beyond_fence,
-    **{name: partial(_boundary, name=name) for name in ("fence", "soft_fence", "people")},
-    **dict.fromkeys(("lowest", "highest"), lambda r: (without_lost(r, r.position[..., 2]),)),
+    **{name: partial(_boundary_distances, name=name) for name in ("fence", "soft_fence", "people")},
+    **dict.fromkeys(("lowest", "highest"), lambda r: (mask_lost(r, r.position[..., 2]),)),
     "thrust": _thrust,
     "tilt": _tilt,
-    "tracking_error": lambda r: (without_lost(r, norms(r.position - r.slot_position)),),
-    "constraint": lambda r: _of_edges(r, np.abs(r.constraint)),
-    "tension": lambda r: _of_edges(r, -r.multiplier),
-    "constraint_force": lambda r: (without_lost(r, norms(r.constraint_force)),),
+    "tracking_error": lambda r: (mask_lost(r, norms(r.position - r.slot_position)),),
+    "constraint": lambda r: _with_edge_owners(r, np.abs(r.constraint)),
+    "tension": lambda r: _with_edge_owners(r, -r.multiplier),
+    "constraint_force": lambda r: (mask_lost(r, norms(r.constraint_force)),),
     "singular_value": lambda r: (r.singular_value, lambda _k: (0,)),
 }

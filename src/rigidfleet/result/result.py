@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
 import numpy as np
 
 from rigidfleet._common.arguments import as_path
-from rigidfleet._common.facts import Fact, FactTable, Row, Sheet, Shown, worst_values
+from rigidfleet._common.facts import Fact, FactTable, Row, Sheet, Shown, table_of_worst_values
 from rigidfleet._common.files import write_file
 from rigidfleet._common.quantities import PLACES, quantity
 from rigidfleet.errors import MissionError, ResultError, wrong_type
-from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, file_content, read_file
+from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, netcdf_content, read_netcdf
 from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
-from rigidfleet.setpoints import Setpoints, at_rate, csv_text, states_of_motion
+from rigidfleet.setpoints import Setpoints, csv_text, setpoints_at_rate, states_of_motion
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -242,12 +242,12 @@ class Result(Shown):
         for name in [name for name in values if name in VARIABLES]:
             value = values[name]
             if value is not None or not VARIABLES[name].optional:
-                self._set(name, value, sizes)
+                self._set_array(name, value, sizes)
         if not later:  # what a flight of this process has made is right
-            self._check(sizes)
+            self._check_arrays(sizes)
         self._sizes = sizes
 
-    def _check(self, sizes: dict[str, int]) -> None:
+    def _check_arrays(self, sizes: dict[str, int]) -> None:
         """Check values: they come from somewhere else."""
         values = self.__dict__
         if sizes["time"] == 0 or sizes["agent"] == 0:
@@ -284,7 +284,7 @@ class Result(Shown):
         if (self.edges[:, 0] == self.edges[:, 1]).any():
             raise ValueError("an edge joins an agent to itself")
 
-    def _set(self, name: str, array: Any, sizes: dict[str, int]) -> None:
+    def _set_array(self, name: str, array: Any, sizes: dict[str, int]) -> None:
         """Set an array whose dimensions agree with ``sizes``, which learns new ones."""
         dims = VARIABLES[name].dims
         value = np.ascontiguousarray(
@@ -309,7 +309,7 @@ class Result(Shown):
         for key, value in made.items():
             if key in self._later and key not in self.__dict__:  # nor has somebody set it
                 if key in VARIABLES:
-                    self._set(key, value, self._sizes)
+                    self._set_array(key, value, self._sizes)
                 else:
                     setattr(self, key, value)
         # Another one, as a copy of this result may have to make the same.
@@ -354,7 +354,7 @@ class Result(Shown):
             if (x := self.extreme(q.name)) is not None and math.isfinite(x.value)
         ]
         contents = FactTable(("about", "result"), rows, ("result",), bare=True)
-        return Sheet(name, title, [contents, worst_values("quantity", worst)])
+        return Sheet(name, title, [contents, table_of_worst_values("quantity", worst)])
 
     @property
     def n_agents(self) -> int:
@@ -483,7 +483,7 @@ class Result(Shown):
         arrays = {name: value for name, value in every.items() if value is not None}
         attributes = {name: getattr(self, name) for name in ATTRIBUTES}
         attributes["phases"] = [asdict(phase) for phase in self.phases]
-        write_file(as_path(path), file_content(VARIABLES, arrays, self.edge_labels, attributes))
+        write_file(as_path(path), netcdf_content(VARIABLES, arrays, self.edge_labels, attributes))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -496,7 +496,7 @@ class Result(Shown):
         """
         path = as_path(path)
         try:
-            return cls(**read_file(path, VARIABLES))
+            return cls(**read_netcdf(path, VARIABLES))
         except ResultError:
             raise
         except MemoryError as error:
@@ -522,7 +522,7 @@ class Result(Shown):
         ValueError
             The rate is not positive, or gives too many setpoints.
         """
-        return at_rate(self.motion(flown=flown), rate)
+        return setpoints_at_rate(self.motion(flown=flown), rate)
 
     def motion(self, *, flown: bool = False) -> Setpoints:
         """The setpoints of every sample, of which there are two at a change of phase; see `setpoints`."""
@@ -562,7 +562,7 @@ vars(Result.__init__)["__signature__"] = signature(lambda self, **fields: None)
 _HINTS = get_type_hints(Result, include_extras=True)
 
 
-def _variable(hint: Any, *, optional: bool) -> Variable:
+def _parse_declaration(hint: Any, *, optional: bool) -> Variable:
     """The declaration that stands beside the type of a field: dimensions | unit | meaning."""
     dims, units, text = hint.__metadata__[0].split(" | ", 2)
     return Variable(
@@ -572,7 +572,7 @@ def _variable(hint: Any, *, optional: bool) -> Variable:
 
 #: Dimensions, unit and meaning of each array of a result.
 VARIABLES: dict[str, Variable] = {
-    f.name: _variable(_HINTS[f.name], optional=f.default is None)
+    f.name: _parse_declaration(_HINTS[f.name], optional=f.default is None)
     for f in fields(Result)
     if hasattr(_HINTS[f.name], "__metadata__")
 }

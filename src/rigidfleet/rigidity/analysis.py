@@ -155,13 +155,13 @@ def analyse(
     p, e = as_framework(slots, edges)
     n, d = len(p), distance_geometry.dimension(p)
     space = dimension if space is None else space
-    flat, axes = flatten(p, space)
+    flat, axes = flatten_points(p, space)
     frame = Framework(flat, e)
     within = analyse(flat[:, :d], e, dimension=d, masses=masses) if 0 < d < space else None
     motions = localised_flexes(frame)
     to_world = axes[:space]
     flexes = tuple(Flex(agents, motion @ to_world) for agents, motion in motions)
-    rigidity_class, reason, stress, bent = classify(frame, within)
+    rigidity_class, reason, stress, bent = classify_rigidity(frame, within)
     return Rigidity(
         agents=n,
         edges=e,
@@ -215,7 +215,7 @@ def as_framework(slots: ArrayLike, edges: ArrayLike) -> tuple[Floats, Ints]:
     return p, e
 
 
-def flatten(p: Floats, space: int) -> tuple[Floats, Floats]:
+def flatten_points(p: Floats, space: int) -> tuple[Floats, Floats]:
     """Points (N, space) about their centre, exactly flat, in axes (3, 3) of which those of the shape come first.
 
     Raises
@@ -246,7 +246,7 @@ def _rigidity_index(frame: Framework, masses: ArrayLike | None) -> float:
     return float(np.linalg.svd(weighted, compute_uv=False)[frame.rank - 1])
 
 
-def classify(
+def classify_rigidity(
     frame: Framework, within: Rigidity | None = None
 ) -> tuple[RigidityClass, str, Floats | None, Floats | None]:
     """Class, reason, blocking stress, deformed shape."""

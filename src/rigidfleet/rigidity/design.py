@@ -21,7 +21,7 @@ from rigidfleet.formation.distance_geometry import dimension, distances
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.math.products import product_in_blocks
 from rigidfleet.rigidity import full_rank, jacobian, rigid_motions
-from rigidfleet.rigidity.analysis import as_framework, flatten
+from rigidfleet.rigidity.analysis import as_framework, flatten_points
 from rigidfleet.typing import Floats, Ints
 
 #: Positions of the exchange's barrier, as shares of the smallest eigenvalue, step by step.
@@ -71,7 +71,7 @@ def design(
         Two slots coincide; or no edges within range hold the shape (the message gives a sufficient range).
     """
     p, _ = as_framework(as_numbers("slots [m]", slots), [])
-    flat, _ = flatten(p, max(1, dimension(p)))
+    flat, _ = flatten_points(p, max(1, dimension(p)))
     n, d = flat.shape
     edges = complete_graph(n)
     length = distances(p, edges)
@@ -88,7 +88,7 @@ def design(
     if rank == 0:
         return near if extra == "complete" else near[:0]
     rows = _rows_of_jacobian(flat, edges)
-    _assert_holds(rows, length, reach, rank)
+    _assert_reach_holds_shape(rows, length, reach, rank)
     wanted = len(near) if extra == "complete" else rank + extra
     if wanted >= len(near):
         return near
@@ -161,7 +161,7 @@ def _least_eigenvalue(rows: Floats) -> float:
     return float(np.linalg.svd(rows, compute_uv=False)[-1] ** 2)
 
 
-def _assert_holds(rows: Floats, length: Floats, reach: float, rank: int) -> None:
+def _assert_reach_holds_shape(rows: Floats, length: Floats, reach: float, rank: int) -> None:
     def rank_within(r: float) -> int:
         within = rows[length <= r]
         return int(np.linalg.matrix_rank(within.T @ within, tol=1e-10)) if len(within) else 0

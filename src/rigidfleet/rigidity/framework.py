@@ -70,17 +70,17 @@ class Framework:
         return distances(self.p, self.edges)
 
     @cached_property
-    def rigid(self) -> Floats:
+    def rigid_basis(self) -> Floats:
         """Rigid motions (N d, t), orthonormal."""
         return rigid_motions(self.p)
 
     @cached_property
     def flexes(self) -> Floats:
         """Motions (N d, k), orthonormal, that change no distance and have no rigid part."""
-        k = self.null.shape[1] - self.rigid.shape[1]
+        k = self.null.shape[1] - self.rigid_basis.shape[1]
         if k <= 0:
             return np.zeros((self.p.size, 0))
-        u = np.linalg.svd(self.null.T @ self.rigid)[0]
+        u = np.linalg.svd(self.null.T @ self.rigid_basis)[0]
         return self.null @ u[:, -k:]
 
     def redundant_edges(self) -> Ints:
@@ -120,13 +120,13 @@ def localised_flexes(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
             chosen.append(motion / np.linalg.norm(motion, axis=1).max())
         if len(chosen) == F.shape[1]:
             break
-    return _without_common_parts(chosen)
+    return _remove_common_parts(chosen)
 
 
 def _candidate_flexes(frame: Framework) -> Iterator[Floats]:
     """Flexes (N, d) among which there is a basis, those that move few agents first."""
     yield from _motions_of_single_agents(frame)
-    few = sparse_flexes(frame.flexes, frame.rigid, len(frame.p))
+    few = sparse_flexes(frame.flexes, frame.rigid_basis, len(frame.p))
     yield from sorted(few, key=_number_of_movers)
     yield from frame.flexes.T.reshape(-1, *frame.p.shape)
 
@@ -135,7 +135,7 @@ def _number_of_movers(motion: Floats) -> int:
     return int(np.count_nonzero(motion.any(axis=1)))
 
 
-def _without_common_parts(motions: list[Floats]) -> list[tuple[tuple[int, ...], Floats]]:
+def _remove_common_parts(motions: list[Floats]) -> list[tuple[tuple[int, ...], Floats]]:
     """Motions (N, d) with their moving agents, fewest first, without parts that fewer agents already have."""
     out: list[tuple[tuple[int, ...], Floats]] = []
     for motion in sorted(motions, key=_number_of_movers):

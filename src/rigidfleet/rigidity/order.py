@@ -50,11 +50,11 @@ class StressEnergy:
         self._i, self._j = frame.edges.T
         self._length = frame.lengths / frame.lengths.mean()
 
-    def stress(self, z: Floats) -> Floats:
+    def nearest_stress(self, z: Floats) -> Floats:
         """Nearest self-stress to forces z (m,)."""
         return z - self.frame.span @ (self.frame.span.T @ z)
 
-    def matrix(self, force: Floats) -> Floats:
+    def energy_matrix(self, force: Floats) -> Floats:
         """Matrix E (k, k) of a self-stress (m,): energy q^T E q of the flex with coordinates q."""
         omega = np.zeros((self.n, self.n))
         np.add.at(omega, (self._i, self._j), -force / self._length)
@@ -62,18 +62,18 @@ class StressEnergy:
         np.fill_diagonal(omega, -omega.sum(axis=1))
         return (self._F.transpose(0, 2, 1) @ (omega @ self._F)).sum(axis=0)
 
-    def adjoint(self, Y: Floats) -> Floats:
+    def adjoint_stress(self, Y: Floats) -> Floats:
         """The self-stress (m,) whose inner product with any stress is <Y, E> of that stress."""
         G = (self._F @ Y @ self._F.transpose(0, 2, 1)).sum(axis=0)
         diagonal = np.diag(G)
         reach = diagonal[self._i] + diagonal[self._j] - 2 * G[self._i, self._j]
-        return self.stress(reach / self._length)
+        return self.nearest_stress(reach / self._length)
 
-    def residual(self, q: Floats) -> Floats:
+    def second_order_residual(self, q: Floats) -> Floats:
         """Residual (m,) that stops a flex with coordinates q at second order; 0 if nothing stops it."""
-        return self.adjoint(np.outer(q, q))
+        return self.adjoint_stress(np.outer(q, q))
 
-    def residual_rate(self, q: Floats) -> Floats:
+    def second_order_residual_rate(self, q: Floats) -> Floats:
         """Derivative (m, k) of `residual`."""
         step = self._F[:, self._i] - self._F[:, self._j]
         rate = 2 * np.einsum("qm,qmk->mk", step @ q, step) / self._length[:, None]
@@ -101,9 +101,9 @@ def blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
         return _search_blocking_stress(energy)
     z = np.zeros(len(frame.edges))
     z[(frame.span**2).sum(axis=1).argmin()] = 1
-    force = energy.stress(z)
+    force = energy.nearest_stress(z)
     force /= np.abs(force).max()
-    value, vector = np.linalg.eigh(energy.matrix(force))
+    value, vector = np.linalg.eigh(energy.energy_matrix(force))
     if value.sum() < 0:
         force, value, vector = -force, -value[::-1], vector[:, ::-1]
     small = _DEFINITE * max(value[-1], 1.0)
@@ -119,15 +119,15 @@ def _search_blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats
     blocking: list[Floats] = []
 
     def lack(z: Floats) -> tuple[float, Floats]:
-        force = energy.stress(z)
-        value, vector = np.linalg.eigh(unit - energy.matrix(force))
+        force = energy.nearest_stress(z)
+        value, vector = np.linalg.eigh(unit - energy.energy_matrix(force))
         if value[-1] < 0.9 and 1 - value[-1] > _DEFINITE * (1 - value[0]):
             blocking.append(force)
             raise StopIteration
         Y = (vector * np.maximum(value, 0)) @ vector.T
-        return 0.5 * float((Y**2).sum()), -energy.adjoint(Y)
+        return 0.5 * float((Y**2).sum()), -energy.adjoint_stress(Y)
 
-    start = energy.adjoint(unit)
+    start = energy.adjoint_stress(unit)
     size = float(start @ start)
     if size > 1e-18:
         start *= energy.k / size  # then the trace of E is that of 1
@@ -136,9 +136,9 @@ def _search_blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats
         best = minimize(lack, start, jac=True, method="L-BFGS-B", options=options)
     except StopIteration:
         return blocking[-1] / np.abs(blocking[-1]).max(), unit[:, :0], False
-    value, vector = np.linalg.eigh(unit - energy.matrix(energy.stress(best.x)))
+    value, vector = np.linalg.eigh(unit - energy.energy_matrix(energy.nearest_stress(best.x)))
     Y = (vector * np.maximum(value, 0)) @ vector.T
-    proven = bool(np.linalg.norm(energy.adjoint(Y)) < 1e-4 * np.linalg.norm(Y))
+    proven = bool(np.linalg.norm(energy.adjoint_stress(Y)) < 1e-4 * np.linalg.norm(Y))
     return None, vector[:, value > 1e-3], proven
 
 
@@ -152,7 +152,7 @@ def finite_flex(energy: StressEnergy) -> tuple[Floats | None, bool]:
     frame = energy.frame
     if energy.k == 0:
         return None, False  # a stress nearly blocks every flex
-    few = sparse_flexes(energy.flexes, frame.rigid, energy.n, _STARTS)
+    few = sparse_flexes(energy.flexes, frame.rigid_basis, energy.n, _STARTS)
     candidates = [energy.flexes.T @ motion.ravel() for motion in few]
     candidates += list(np.random.default_rng(0).normal(size=(_STARTS, energy.k)))
     goes_on = False
@@ -172,15 +172,15 @@ def _extend_to_second_order(energy: StressEnergy, q: Floats) -> Floats | None:
     """A flex (k,) near q that extends to second order, by Gauss-Newton on the unit sphere."""
     q = q / max(np.linalg.norm(q), 1e-9)
     for _ in range(40):
-        rest = energy.residual(q)
+        rest = energy.second_order_residual(q)
         if np.linalg.norm(rest) < 1e-11:
             break
-        rate = energy.residual_rate(q)
+        rate = energy.second_order_residual_rate(q)
         rate -= np.outer(rate @ q, q)
         damping = 0.3 * np.linalg.norm(rest) * np.eye(energy.k)
         q = q - np.linalg.solve(rate.T @ rate + damping, rate.T @ rest)
         q = q / np.linalg.norm(q)
-    return q if np.linalg.norm(energy.residual(q)) < 1e-6 else None
+    return q if np.linalg.norm(energy.second_order_residual(q)) < 1e-6 else None
 
 
 def _follow_flex(frame: Framework, direction: Floats) -> Floats | None:
@@ -192,7 +192,7 @@ def _follow_flex(frame: Framework, direction: Floats) -> Floats | None:
     here, best, most = p, p, 0.0
     for _ in range(80):
         there = restore_lengths(here + step * direction, frame.edges, frame.lengths, _EQUAL * size)
-        moved = np.zeros_like(p) if there is None else align(there, here) - here
+        moved = np.zeros_like(p) if there is None else align_points(there, here) - here
         if not 0.5 * step < np.linalg.norm(moved) < 2 * step:
             if here is p or step < 1e-3 * size:
                 break
@@ -200,7 +200,7 @@ def _follow_flex(frame: Framework, direction: Floats) -> Floats | None:
             continue
         here, direction = here + moved, moved / np.linalg.norm(moved)
         step = min(1.5 * step, 0.05 * size * np.sqrt(len(p)))
-        gone = np.linalg.norm(align(here, p) - p, axis=1).max()
+        gone = np.linalg.norm(align_points(here, p) - p, axis=1).max()
         best, most = (here, gone) if gone > most else (best, most)
         if most > _FAR * size:
             break
@@ -262,7 +262,7 @@ def are_joined(frame: Framework, goal: Floats, strides: int) -> bool:
     size = np.linalg.norm(here - here.mean(axis=0), axis=1).max()
     step = most = _STRIDE * size * np.sqrt(len(here))
     for _ in range(strides):
-        gap = (align(goal, here) - here).ravel()
+        gap = (align_points(goal, here) - here).ravel()
         if np.linalg.norm(gap) <= step:
             return True
         flexes = Framework(here, frame.edges).flexes
@@ -271,7 +271,7 @@ def are_joined(frame: Framework, goal: Floats, strides: int) -> bool:
         ahead = flexes @ ahead / max(np.linalg.norm(ahead), 1e-12)
         there = here + step * ahead.reshape(here.shape)
         there = restore_lengths(there, frame.edges, frame.lengths, 1e-9 * size)
-        if there is None or not 0.5 < np.linalg.norm(align(there, here) - here) / step < 2:
+        if there is None or not 0.5 < np.linalg.norm(align_points(there, here) - here) / step < 2:
             step /= 3  # round a sharp bend
             if step < 1e-3 * most:
                 return False
@@ -280,7 +280,7 @@ def are_joined(frame: Framework, goal: Floats, strides: int) -> bool:
     return False
 
 
-def align(p: Floats, onto: Floats) -> Floats:
+def align_points(p: Floats, onto: Floats) -> Floats:
     """Points p (N, d) moved rigidly, without reflection in their d dimensions, to fit others."""
     x, y = p - p.mean(axis=0), onto - onto.mean(axis=0)
     u, _, vt = np.linalg.svd(y.T @ x)

@@ -10,9 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet._common.renamed import with_earlier_names
-from rigidfleet.rigidity.analysis import RigidityClass, as_framework, classify, flatten
+from rigidfleet.rigidity.analysis import (
+    RigidityClass,
+    as_framework,
+    classify_rigidity,
+    flatten_points,
+)
 from rigidfleet.rigidity.framework import Framework
-from rigidfleet.rigidity.order import STRIDES, align, are_joined, descend_to_lengths
+from rigidfleet.rigidity.order import STRIDES, align_points, are_joined, descend_to_lengths
 from rigidfleet.typing import Floats, Ints
 
 #: Shapes whose all-pairs distances differ by less than this share of their size count as equal.
@@ -135,7 +140,7 @@ def realisations(
     """
     p, e = as_framework(slots, edges)
     drawn = p - p.mean(axis=0)
-    p, axes = (drawn, np.eye(3)) if dimension == 3 else flatten(p, dimension)
+    p, axes = (drawn, np.eye(3)) if dimension == 3 else flatten_points(p, dimension)
     n, length = len(p), np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
     size = float(np.linalg.norm(p, axis=1).max(initial=0.0))
     if n < 2 or not len(e):
@@ -158,7 +163,7 @@ def realisations(
         at = np.asarray(start, dtype=np.float64)
         if at.shape != (n, 3) or not np.isfinite(at).all():
             raise ValueError(f"start must be ({n}, 3) finite positions [m], not {at.shape}")
-        begin = align(at, drawn) @ axes[:dimension].T
+        begin = align_points(at, drawn) @ axes[:dimension].T
         end = follow_lengths(begin, e, length, _REACHED * size)
     last = None if end is None else groups.add(end, 0)
     first = groups.families(e)
@@ -184,11 +189,11 @@ class _Groups:
         pairs = _distances_of_pairs(p)
         alike = [np.abs(known - pairs).max() <= self._tol for known in self._pairs]
         for k, q in enumerate(self.shapes):
-            if alike[k] and (not alike[0] or self._fits(p, q)):
+            if alike[k] and (not alike[0] or self._is_same_shape(p, q)):
                 self.counts[k] += count
                 return k
         self._pairs.append(pairs)
-        self.shapes.append(align(p, self._intended))
+        self.shapes.append(align_points(p, self._intended))
         self.counts.append(count)
         return len(self.shapes) - 1
 
@@ -208,9 +213,9 @@ class _Groups:
                         break
         return first
 
-    def _fits(self, p: Floats, q: Floats) -> bool:
+    def _is_same_shape(self, p: Floats, q: Floats) -> bool:
         # Distance errors e make a flat shape sqrt(e) thick, so a wide gap must distinguish a mirror image.
-        return bool(np.linalg.norm(align(p, q) - q, axis=1).max() <= 30 * self._tol)
+        return bool(np.linalg.norm(align_points(p, q) - q, axis=1).max() <= 30 * self._tol)
 
 
 def _realisation(
@@ -219,13 +224,13 @@ def _realisation(
     deviation = float(np.abs(_distances_of_pairs(q) - _distances_of_pairs(p)).max(initial=0.0))
     closest = float(_distances_of_pairs(q).min(initial=np.inf))
     if deviation <= _ALIKE * size:
-        same = np.linalg.norm(align(q, p) - p, axis=1).max(initial=0.0) <= 30 * _ALIKE * size
+        same = np.linalg.norm(align_points(q, p) - p, axis=1).max(initial=0.0) <= 30 * _ALIKE * size
         kind = Kind.SAME if same else Kind.MIRRORED
     else:
         kind = Kind.COINCIDENT if closest <= _ALIKE * size else Kind.FOLDED
     frame = Framework(q, e)
     rigid = frame.flexes.shape[1] == 0
-    bends = not rigid and classify(frame)[0] is RigidityClass.FLEXIBLE
+    bends = not rigid and classify_rigidity(frame)[0] is RigidityClass.FLEXIBLE
     return Realisation(kind, q @ axes[: q.shape[1]], starts, deviation, closest, rigid, bends)
 
 
@@ -244,7 +249,7 @@ def follow_lengths(
     """
     at = start[None]
     now = ((start[e[:, 0]] - start[e[:, 1]]) ** 2).sum(axis=1)
-    goal = None if slots is None else align(slots, start)
+    goal = None if slots is None else align_points(slots, start)
     steps = 50
     for k in range(1, steps + 1):
         squares = now + (length**2 - now) * (k / steps)

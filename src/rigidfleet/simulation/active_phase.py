@@ -14,7 +14,7 @@ from rigidfleet.kernel.problem import OPEN, TRACKING, Problem, Workspace
 from rigidfleet.kernel.records import IntegratorState, Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Settle
-from rigidfleet.planning.disturbances import without
+from rigidfleet.planning.disturbances import drop_lost
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.simulation.callbacks import (
@@ -23,7 +23,7 @@ from rigidfleet.simulation.callbacks import (
     ExternalForce,
     Observation,
     call_user,
-    checked_force,
+    check_force,
 )
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.recording import (
@@ -81,7 +81,7 @@ class ActivePhase:
         if plan.before.lost is not None:
             self.lost = plan.before.lost
         self.parted = plan.links_lost[1] <= plan.start  # (L,) links that are lost
-        self.next_loss = self._loss_ahead()  # of a vehicle or a link [s]
+        self.next_loss = self._next_loss()  # of a vehicle or a link [s]
         self.control_calls = 0  # number of calls of the user's controller
         self.held: Problem | None = None  # with the controller's force
         # Evaluations, steps and rejections before a loss.
@@ -104,7 +104,7 @@ class ActivePhase:
         """Fly to ``t_end`` [s] and record the samples on the way."""
         raise NotImplementedError
 
-    def watch(self, *, last: bool) -> None:
+    def search_extremes(self, *, last: bool) -> None:
         """Search the steps flown for extremes; ``last``: no further steps of this problem follow."""
         raise NotImplementedError
 
@@ -136,12 +136,12 @@ class ActivePhase:
         return float(self.state.clock[records.TIME])
 
     @property
-    def over(self) -> bool:
+    def is_over(self) -> bool:
         """Whether the phase has reached its latest end."""
         return self.t >= self.plan.t_end
 
     @property
-    def flew(self) -> bool:
+    def has_flown(self) -> bool:
         """Whether anything of the phase was flown, or was to be when the flight stopped."""
         return self.begun or self.t > self.plan.start
 
@@ -192,7 +192,7 @@ class ActivePhase:
         answer = call_user("the controller", when, controller, self.observe())
         if isinstance(answer, Command):
             return self.problem_under(answer)
-        force = checked_force(answer, len(self.lost), "the controller", self.t)
+        force = check_force(answer, len(self.lost), "the controller", self.t)
         control = self.plan.problem.control._replace(kind=OPEN, force=force)
         return self.plan.problem._replace(control=control)
 
@@ -207,24 +207,24 @@ class ActivePhase:
             self.fly_to(min(t, t_end), controller, rate)
             if self.t < min(t, self.plan.t_end):
                 return  # between two checks
-            quiet = self.t - self.lateness >= least and self._error() <= settle.tolerance
+            quiet = self.t - self.lateness >= least and self._largest_error() <= settle.tolerance
             self.quiet_since = min(self.quiet_since, self.t) if quiet else math.inf
 
-    def steer(self, problem: Problem) -> None:
+    def continue_by_hand(self, problem: Problem) -> None:
         """Continue with another problem of the same size, such as one with a different reference, by hand."""
         self.plan.problem = problem
         self.counted[records.EVALUATIONS] += self.state.count[records.EVALUATIONS]
         # A different law: its derivative is not known yet.
         self.state.count[records.EVALUATIONS] = 0
 
-    def evaluate(self) -> None:
+    def evaluate_law_now(self) -> None:
         """Evaluate the law at the current state; forces and references are then in the workspace."""
         y, t = self.state.y, self.t - self.lateness
         native.closed_loop(t, y, np.empty_like(y), self.plan.problem, self.workspace)
 
     def observe(self) -> Observation:
         """What a controller sees at the current state."""
-        self.evaluate()
+        self.evaluate_law_now()
         w, vehicles = self.workspace, self.plan.problem.vehicles
         noisy = len(self.plan.problem.disturbance.noise_r) > 0
         r, v = (w.r_seen, w.v_seen) if noisy else (w.r, w.v)
@@ -239,14 +239,14 @@ class ActivePhase:
         self.raise_errors()
         if not (self.state.count[records.EVALUATIONS] or self.t > self.plan.start):
             return self.plan.before
-        self.evaluate()
+        self.evaluate_law_now()
         return self.plan.state_at_end(self.t, self.state.y, self.workspace)
 
     def raise_errors(self) -> None:
         """Raise errors of the multipliers' solver, or of the monitor's solver."""
         if self.solver is not None:
-            self.solver.check()
-            self.solver.solver_for_thread.check()
+            self.solver.raise_pending_error()
+            self.solver.solver_for_thread.raise_pending_error()
 
     # -- inside -----------------------------------------------------------------------------------
 
@@ -266,7 +266,7 @@ class ActivePhase:
 
         Returns the remaining problem.
         """
-        self.watch(last=True)
+        self.search_extremes(last=True)
         self.raise_errors()
         plan, y, own = self.plan, self.state.y, problem is self.plan.problem
         self.parted = plan.links_lost[1] <= self.t
@@ -274,7 +274,7 @@ class ActivePhase:
             self.lost = self.lost | now
             plan.before.lost = self.lost
             self.extremes.remove_lost(self.lost)
-        self.next_loss = self._loss_ahead()
+        self.next_loss = self._next_loss()
         n = len(self.lost)
         self.count_work()
         kept = plan.remove_lost_edges(self.lost, self.parted)
@@ -286,11 +286,11 @@ class ActivePhase:
         if own:
             return plan.problem
         mu = plan.problem.law.mu
-        held = without(problem, kept, self.lost, mu, large=plan.large)
+        held = drop_lost(problem, kept, self.lost, mu, large=plan.is_large)
         self.held = held._replace(graph=plan.problem.graph)
         return self.held
 
-    def _loss_ahead(self) -> float:
+    def _next_loss(self) -> float:
         """Time [s] at which the next vehicle or link is lost; infinity if none is."""
         if not self.plan.loses:
             return math.inf
@@ -307,13 +307,13 @@ class ActivePhase:
         """Times (K,) [s] to record from now to ``t_end`` [s]."""
         return self.sampler(self.plan, self.t, t_end, first=not self.begun, stop=self.stop)
 
-    def _error(self) -> float:
+    def _largest_error(self) -> float:
         """Largest error [m] of a constraint, a slot or the goal at the integrator's state.
 
         An attitude error counts as the distance by which it moves a slot.
         """
         plan, w = self.plan, self.workspace
-        self.evaluate()
+        self.evaluate_law_now()
         errors = [np.abs(w.c).max(initial=0.0)]
         local = plan.problem.control.kind == TRACKING
         if local:
@@ -332,7 +332,7 @@ class ActivePhase:
             errors.append(np.linalg.norm(plan.slots @ turned, axis=1).max())
         return float(max(errors))
 
-    def store(
+    def store_piece(
         self,
         times: Floats,
         source: Record | Unevaluated,

@@ -30,7 +30,7 @@ def mission_as_flown(
     begun : each phase as it was begun
     step : between samples [s]
     """
-    records = _with_unique_names(flown)
+    records = _make_names_unique(flown)
     data = mission.to_dict()
     data.pop("source", None)  # it no longer reproduces a figure
     data["name"] = f"{mission.name.removesuffix('-live')}-live"
@@ -71,11 +71,11 @@ def phase_of_table(
         spread = expand_phases(made, timed_leg)
         if len(spread.phases) == len(made.phases):  # with the ways that were found
             made = spread
-    _refuse_replaced(made.phases[-1])
+    _refuse_expanded_phase(made.phases[-1])
     return made.phases[-1]
 
 
-def _refuse_replaced(phase: Phase) -> None:
+def _refuse_expanded_phase(phase: Phase) -> None:
     """See that a phase has a flight of its own."""
     if phase.replaced:
         problem = "finds its way before the flight, and cannot begin by hand"
@@ -104,7 +104,7 @@ def check_formation(mission: Mission, phase: Phase) -> None:
         raise wrong_type(
             "a phase (a table as in a mission file, or one of a mission's phases)", phase
         )
-    _refuse_replaced(phase)
+    _refuse_expanded_phase(phase)
     shaping = phase.shaping
     if shaping is None:
         return
@@ -119,7 +119,7 @@ def check_formation(mission: Mission, phase: Phase) -> None:
         raise MissionError([Finding("begin()", "formation", name, problem, remedy)])
 
 
-def _with_unique_names(flown: Sequence[PhaseRecord]) -> list[PhaseRecord]:
+def _make_names_unique(flown: Sequence[PhaseRecord]) -> list[PhaseRecord]:
     """Records of phases with unique names."""
     taken = {record.name for record in flown}
     seen: set[str] = set()

@@ -14,17 +14,17 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from rigidfleet.assessment import Verdict, assess
-from rigidfleet.assessment.alignment import Alignment, align
+from rigidfleet.assessment.alignment import Alignment, fit_alignment
 from rigidfleet.assessment.doubt import DrawnWays, doubt_facts, verdict_with_doubt
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign.curves import ASSUMED, Trajectories
 from rigidfleet.math import smoothing
-from rigidfleet.math.piecewise import Piecewise, join
+from rigidfleet.math.piecewise import Piecewise, join_curves
 from rigidfleet.math.smoothing import NoiseEstimate, PositionNoise, Positions, Smoothed
 from rigidfleet.result import Extremum, Result
 from rigidfleet.setpoints import ways_of
 from rigidfleet.simulation.extremes import CurveWatch
-from rigidfleet.simulation.trajectories import of_curve, result_of, watch_curve
+from rigidfleet.simulation.trajectories import result_of, result_of_curve, watch_curve
 from rigidfleet.typing import Floats
 
 #: What is believed of clocks: that they are those of the plan as recorded, that one offset is all that they differ from
@@ -68,7 +68,7 @@ def judge_log(
     Parameters
     ----------
     read : the log
-    plan : the flight that was planned; None: there is none, and limits are those ``judged``, see `of_curve`
+    plan : the flight that was planned; None: there is none, and limits are those ``judged``, see `result_of_curve`
 
     Raises
     ------
@@ -112,28 +112,28 @@ def _likely_flight(
     estimate = _noise_of_logs(logs, doubts)
     noise = estimate.noise or PositionNoise(math.nan)
     planned = None if plan is None else _planned_ways(plan)
-    alignment, smoothed, late = None, _smooth_all(logs, noise), np.zeros(1)
+    alignment, smoothed, late = None, _smooth_ways(logs, noise), np.zeros(1)
     if planned is not None:
         plans = planned.pieces[:, :, :3].swapaxes(0, 1)
         times = [np.arange(log.time[0], log.time[-1], _ALIGNED) for log in logs]
         places = [(t, own.way.at(t)) for t, own in zip(times, smoothed, strict=True)]
-        alignment = align(places, [Piecewise(planned.time, x) for x in plans], doubts.clock)
-        offsets, late = _offsets(alignment, doubts.clock)
+        alignment = fit_alignment(places, [Piecewise(planned.time, x) for x in plans], doubts.clock)
+        offsets, late = _clock_offsets(alignment, doubts.clock)
         every = np.broadcast_to(offsets, len(logs))
         logs = [log._replace(time=log.time - by) for log, by in zip(logs, every, strict=True)]
         if offsets.any():
-            smoothed = _smooth_all(logs, noise)
+            smoothed = _smooth_ways(logs, noise)
     # Beside a plan, a sample counts a usual step beyond it, by part of which clocks may be off.
     ends = np.array([log.time[[0, -1]] for log in logs])
     if planned is not None:
         ends += np.array([[-1.0, 1.0]]) * [[np.median(np.diff(log.time))] for log in logs]
     each = zip(smoothed, ends.tolist(), strict=True)
-    whole = join([own.way.between(*end) for own, end in each])
+    whole = join_curves([own.way.between(*end) for own, end in each])
     spans = ends.tolist() if read.away and np.ptp(ends, axis=0).any() else []
     if plan is None or planned is None:
         blank = Piecewise(whole.time, np.full((*whole.pieces.shape[:2], 1, 1), np.nan))
         judged |= {"names": read.names, "spans": spans, "since": read.since}
-        flown = of_curve(whole.stack(blank), WORDS, **judged)
+        flown = result_of_curve(whole.stack(blank), WORDS, **judged)
     else:
         flown = flight_of_plan(plan, planned, whole, spans)
     del whole, planned  # large
@@ -147,8 +147,8 @@ def _likely_flight(
         return flown, None, estimate, alignment
     # Noise of a known size and an unknown course may be any of several; each gives ways of its own.
     unknown = _COURSES if estimate.words and estimate.source == "stated" else ()
-    models = [smoothed, *(_smooth_all(logs, noise._replace(tau=tau)) for tau in unknown)]
-    drawn = _deviations(flown, models, late)
+    models = [smoothed, *(_smooth_ways(logs, noise._replace(tau=tau)) for tau in unknown)]
+    drawn = _deviations_of_draws(flown, models, late)
     if plan is not None:
         few = slice(None, None, -(-len(flown.time) // _BANDS))
         place = np.linalg.norm(drawn[:, 0, few], axis=3).max(axis=0).round(6)
@@ -161,16 +161,16 @@ def _noise_of_logs(logs: Sequence[Positions], doubts: Doubts) -> NoiseEstimate:
     size, tau = doubts.noise, doubts.tau
     if not isinstance(size, str) and tau is not None:
         return NoiseEstimate(PositionNoise(size, tau), "stated", "")
-    shown = smoothing.noise_of(logs, None, _STEP)
+    shown = smoothing.fit_noise(logs, None, _STEP)
     if isinstance(size, str):
         return shown
     if shown.noise is None or shown.noise.sigma <= _MORE * size:
-        return smoothing.noise_of(logs, size, _STEP)
+        return smoothing.fit_noise(logs, size, _STEP)
     words = f"that is more than the {1e3 * size:.3g} mm stated"
     return shown._replace(words=words)
 
 
-def _smooth_all(logs: Sequence[Positions], noise: PositionNoise) -> list[Smoothed]:
+def _smooth_ways(logs: Sequence[Positions], noise: PositionNoise) -> list[Smoothed]:
     """Likely ways, on knots as rare as each one's samples; rare knots are at some of the others', whatever the rate."""
     usual = np.array([max(_STEP, np.median(np.diff(log.time))) for log in logs])
     steps = usual.min() * 2.0 ** np.floor(np.log2(usual / usual.min()))
@@ -190,7 +190,7 @@ def _planned_ways(plan: Result) -> Piecewise:
     return ways_of(slots._replace(state=state, yaw=still, yaw_rate=still), slice(None))
 
 
-def _offsets(alignment: Alignment, clock: Clock) -> Floats:
+def _clock_offsets(alignment: Alignment, clock: Clock) -> Floats:
     """By how much stamps are late (2, N or 1) [s] and the error, as far as that is taken out: of each, or of all.
 
     Raises
@@ -208,7 +208,7 @@ def _offsets(alignment: Alignment, clock: Clock) -> Floats:
     return offsets
 
 
-def _deviations(flown: Result, models: Sequence[Sequence[Smoothed]], late: Floats) -> Any:
+def _deviations_of_draws(flown: Result, models: Sequence[Sequence[Smoothed]], late: Floats) -> Any:
     """By how much ways drawn differ from the likely one (S, 3, K, N, 3); ``late``: errors of clocks (N or 1,) [s]."""
     random, time = np.random.default_rng(0), flown.time + flown.statistics.get("clock", 0.0)
     count = int(np.clip(_KNOTS // sum(len(x.knots) for x in models[0]), _LEAST, _MOST))
@@ -218,7 +218,7 @@ def _deviations(flown: Result, models: Sequence[Sequence[Smoothed]], late: Float
         inside = flown.left[:, i]
         drawn = [model[i].draw(share, random) for model, share in zip(models, shares, strict=True)]
         points = np.concatenate(drawn, axis=2) - likely.points[..., None]
-        states = smoothing.spline(likely.knots, points).states(time[inside], 3)
+        states = smoothing.spline_of_points(likely.knots, points).states(time[inside], 3)
         off[:, :, inside, i] = np.moveaxis(states, -1, 0)
     rates = np.stack([flown.velocity, np.nan_to_num(flown.acceleration)])
     for s, by in enumerate(late * random.standard_normal((count, len(late)))):

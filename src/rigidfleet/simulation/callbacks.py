@@ -124,7 +124,7 @@ def finite_numbers(x: ArrayLike, shape: tuple[int, ...]) -> Floats:
     return array
 
 
-def checked_command(command: Command, n: int, t: float) -> dict[str, Floats]:
+def check_command(command: Command, n: int, t: float) -> dict[str, Floats]:
     """Arrays of a command, by their names; an error says which one is wrong."""
     rows = {"thrust": (n,), "attitude": (n, 4), "rates": (n, 3), "speed": (n, 4)}
     arrays = {}
@@ -146,7 +146,7 @@ def checked_command(command: Command, n: int, t: float) -> dict[str, Floats]:
     return arrays
 
 
-def checked_force(f: ArrayLike, n: int, who: str, t: float) -> Floats:
+def check_force(f: ArrayLike, n: int, who: str, t: float) -> Floats:
     """Forces (N, 3) [N] from a user's function, checked; an error says what it returned instead."""
     try:
         return finite_numbers(f, (n, 3))
@@ -183,7 +183,7 @@ class ExternalForce:
             try:
                 if self.error is None:
                     answer = call_user("the force", f"at t = {t:.3f} s", force, t, *x)
-                    places(f)[:] = checked_force(answer, n, "the force", t)
+                    places(f)[:] = check_force(answer, n, "the force", t)
                     return
             except BaseException as error:
                 self.error = error
@@ -192,7 +192,7 @@ class ExternalForce:
         self._keep = self._SIGNATURE(call)
         self.address = int(ctypes.cast(self._keep, ctypes.c_void_p).value or 0)
 
-    def check(self) -> None:
+    def raise_user_error(self) -> None:
         """Raise the error that the user's function raised, and call the function again from then on."""
         error, self.error = self.error, None
         if error is not None:

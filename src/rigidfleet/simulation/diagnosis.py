@@ -45,7 +45,7 @@ def diagnose(at: ActivePhase, *, own_force: bool, collapsed: bool) -> str:
             f"{head}; the multipliers are solved by {solvers.WORDS[at.plan.method]}, which lost a pivot"
             f" {lost} times and found no solution {failed} times. {remedy()}"
         )
-    J, closest, length = _jacobian(at)
+    J, closest, length = _jacobian_and_shortest_edge(at)
     edge = "-".join(str(int(a) + 1) for a in at.plan.edges[closest])
     if not np.isfinite(J).all():
         return (
@@ -65,12 +65,12 @@ def diagnose(at: ActivePhase, *, own_force: bool, collapsed: bool) -> str:
         bound = "no bound" if solver == "exact" else "no bound except its cut-off"
         return (
             f'{head}, and {where}. The force of solver "{solver}" has {bound} where a singular value'
-            f' vanishes. Use solver = "iterated" (or "spectral"){_smoother(at.plan)}'
+            f' vanishes. Use solver = "iterated" (or "spectral"){_smoothing_advice(at.plan)}'
         )
     return f"{head}, and {where}. {remedy()}"
 
 
-def _smoother(plan: PhasePlan) -> str:
+def _smoothing_advice(plan: PhasePlan) -> str:
     """What else helps a law without bound: a smooth reference, feedback; "" if it has both."""
     words = ""
     shaping = plan.phase.shaping
@@ -115,7 +115,7 @@ def _remedy(at: ActivePhase, *, own_force: bool, collapsed: bool) -> str:
     )
 
 
-def _jacobian(at: ActivePhase) -> tuple[Floats, int, float]:
+def _jacobian_and_shortest_edge(at: ActivePhase) -> tuple[Floats, int, float]:
     """J (m, 3N) at the integrator's state, the shortest edge and its length [m]."""
     edges = at.plan.edges
     native.closed_loop(at.t, at.state.y, np.empty_like(at.state.y), at.plan.problem, at.workspace)

@@ -24,7 +24,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import Mission, Obstacle
 from rigidfleet.mission.boundaries import BoundaryWatch
 from rigidfleet.result import PAD, Extremum, PhaseRecord
-from rigidfleet.solids.records import join
+from rigidfleet.solids.records import join_solids
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -107,13 +107,13 @@ class CurveWatch:
         #: Obstacles of all kinds, unless all are boxes that the monitor itself takes.
         self.solids = None
         if None in corners:
-            self.solids, corners = join([thing.solid for thing in obstacles]), []
+            self.solids, corners = join_solids([thing.solid for thing in obstacles]), []
         self.boxes = np.array(corners).reshape(-1, 6)
 
     def _begin_monitor(self, states: int, gauge: int) -> None:
         """Begin to monitor trails of so many states and forces."""
         self.monitor = native.Watch(
-            records.monitor(
+            records.new_monitor(
                 self.radius, self.boxes, self.fence, states, gauge,
                 worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
                 standing=self.standing, low=self.low, pad=PAD, altitude=self.altitude, pairs=self.pairs,
@@ -127,7 +127,7 @@ class CurveWatch:
         The first 3N are positions [m], the others velocities [m/s], world axes.
         """
         # Of a problem, the monitor of curves reads how many vehicles there are, and of an integrator the trail alone.
-        problem, work, state = packing.examples()[:3]
+        problem, work, state = packing.example_tuples()[:3]
         problem = problem._replace(vehicles=problem.vehicles._replace(m=np.ones(self.n)))
         trail = state.trail._replace(clock=clock, points=points)
         if "monitor" not in vars(self):
@@ -141,7 +141,7 @@ class CurveWatch:
         self.left[:] = left
         self._list_all_pairs()
         if "monitor" in vars(self):
-            self._watch_listed(0.0)
+            self._watch_listed_pairs(0.0)
         self.moved[:] = np.inf  # of a large fleet, no pairs are listed yet
 
     def deepest_contact(self) -> Extremum | None:
@@ -157,7 +157,7 @@ class CurveWatch:
         steps = int(state.count[records.TRAILED])
         self._take_solids(problem, state, first, steps)
         if self.boundaries.every:
-            rows = _rows(state, np.arange(first, steps))
+            rows = _trail_rows(state, np.arange(first, steps))
             clock, points = state.trail.clock[rows], state.trail.points[rows]
             self.boundaries.take_steps(*steps_in_world(clock, points, problem), self.left)
         if self.n > _FEW:
@@ -177,19 +177,19 @@ class CurveWatch:
         for name, kind in _CONTACTS.items():
             if name in self.touched or not self.worst[kind] < -_TOUCH:
                 continue
-            deepest = partial(self._deepest, kind, problem, work, state)
-            rows = _rows(state, some)
+            deepest = partial(self._deepest_of_kind, kind, problem, work, state)
+            rows = _trail_rows(state, some)
             steps, points = state.trail.clock[rows], state.trail.points[rows]
             while steps[-1].sum() - steps[0, 0] > _INSTANT:
                 if len(steps) == 1:
-                    steps, points = _halves(*steps[0], points[0])
+                    steps, points = _halve_step(*steps[0], points[0])
                 half = len(steps) // 2
                 part = slice(half) if deepest(steps[:half], points[:half]) else slice(half, None)
                 steps, points = steps[part], points[part]
             if (contact := deepest(steps, points)) is not None:
                 self.touched[name] = contact
 
-    def _deepest(
+    def _deepest_of_kind(
         self, kind: int, problem: Problem, work: Workspace, state: Any, *steps: Floats
     ) -> Extremum | None:
         """The deepest contact of a kind in steps (S, 2), (S, 5, n) of an integrator; None if there is none."""
@@ -212,7 +212,7 @@ class CurveWatch:
     ) -> None:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
         if self.solids is not None:
-            self.monitor.clearances(problem, state, first, end, self.solids)
+            self.monitor.search_clearances(problem, state, first, end, self.solids)
 
     def extremes_so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
@@ -277,11 +277,11 @@ class CurveWatch:
         self, problem: Problem, work: Workspace, state: records.IntegratorState, step: int
     ) -> None:
         """Monitor the distances of one step, in which only the listed pairs matter."""
-        row = _rows(state, (step,))
+        row = _trail_rows(state, (step,))
         clock, points = state.trail.clock[row], state.trail.points[row]
         trail = records.Trail(clock, points, state.trail.gauge[:0], state.trail.start)
         alone = state._replace(trail=trail)
-        self.monitor.bound_moves(problem, alone)
+        self.monitor.bound_distance_changes(problem, alone)
         moved = self.monitor.monitor.moves.copy()
         if not self.stacks:
             moved[1] = 0.0
@@ -302,7 +302,7 @@ class CurveWatch:
         x = y[: 3 * self.n].reshape(-1, 3)[who]
         if len(who) < 2:
             self.pairs = self.columns = np.zeros((0, 2), dtype=np.int64)
-            self._watch_listed(math.inf)
+            self._watch_listed_pairs(math.inf)
             return
         widest = 2.0 * float(self.radius[who].max())
         tree = KDTree(x, balanced_tree=False, compact_nodes=False)
@@ -327,9 +327,9 @@ class CurveWatch:
             flat = KDTree(x[:, :2], balanced_tree=False, compact_nodes=False)
             columns = who[flat.query_pairs(widest + spare, output_type="ndarray")]
             self.columns = np.ascontiguousarray(np.sort(columns, axis=1))
-        self._watch_listed(spare)
+        self._watch_listed_pairs(spare)
 
-    def _watch_listed(self, spare: float) -> None:
+    def _watch_listed_pairs(self, spare: float) -> None:
         """Monitor the listed pairs; no others matter until distances have changed by ``spare`` [m]."""
         self.spare, self.moved[:] = spare, 0.0
         self._renew_monitor(pairs=self.pairs, columns=self.columns)
@@ -360,7 +360,7 @@ class Extremes(CurveWatch):
         if "monitor" in vars(self):
             self._renew_monitor(boxes=self.boxes)
 
-    def begin(
+    def begin_monitoring(
         self,
         y: Floats,
         t: float,
@@ -377,7 +377,7 @@ class Extremes(CurveWatch):
         size = states or len(y), edges
         if size != self.size:  # else the memory of the phase before serves this one
             self.size, room = size, records.VEHICLES_TRAIL if states else records.POINTS_TRAIL
-            self.trail = records.trail(room, size[0], self.n, edges, self.directed)
+            self.trail = records.new_trail(room, size[0], self.n, edges, self.directed)
             self._begin_monitor(size[0], self.trail.gauge.shape[1])
         return records.integrator(y, t, rtol=rtol, atol=atol, trail=self.trail)
 
@@ -402,7 +402,7 @@ class Extremes(CurveWatch):
     ) -> None:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
         self.take_path(problem, work, state, int(self.monitor.monitor.count[records.STAYED]))
-        self.monitor.forces(problem, work, state, last=last)
+        self.monitor.search_forces(problem, work, state, last=last)
 
     def free_steps(self, state: records.IntegratorState) -> int:
         """Number of steps for which the trail has room beside those that another thread evaluates."""
@@ -417,19 +417,19 @@ class Extremes(CurveWatch):
         """
         taken, count = state._replace(count=state.count.copy()), state.count
         # The last step stays, until its neighbour is known.
-        row = _rows(state, count[records.TRAILED] - 1)
+        row = _trail_rows(state, count[records.TRAILED] - 1)
         count[records.TRAILED], count[records.FIRST_ROW] = 1, row
         if self._thread is None:
             from concurrent.futures import ThreadPoolExecutor
 
             self._thread = ThreadPoolExecutor(1)
-        self._taking = self._thread.submit(self._take_aside, problem, work, taken)
+        self._taking = self._thread.submit(self._take_steps_aside, problem, work, taken)
 
-    def _take_aside(self, *arguments: Any) -> None:
+    def _take_steps_aside(self, *arguments: Any) -> None:
         self.take_steps(*arguments, last=False)
         packing.forget_last_packed()  # the phase may be over before this thread packs others
 
-    def wait(self) -> None:
+    def wait_for_steps(self) -> None:
         """Wait until the steps that were handed over are evaluated."""
         if self._taking is not None:
             error = self._taking.exception()  # Ctrl-C ends the waiting, not the evaluation
@@ -452,9 +452,9 @@ class Extremes(CurveWatch):
         self.of_vehicles = {}
         rotors, left = ~(vehicles.point | gone), np.flatnonzero(~gone)
         for k, kind, sign in _SAMPLED:
-            self._take_first(kind, sign * state.worst[left, k], state.worst_time[left, k], left)
+            self._take_least(kind, sign * state.worst[left, k], state.worst_time[left, k], left)
         load, when = (x[left, fleet.LOAD] for x in (state.worst, state.worst_time))
-        self._take_first(records.THRUST_MARGIN, vehicles.limit[left] - load, when, left)
+        self._take_least(records.THRUST_MARGIN, vehicles.limit[left] - load, when, left)
         rows: dict[str, tuple[Floats, Floats]] = {}
         if rotors.any():
             peak = np.where(rotors[:, None], state.peak, -1.0)
@@ -500,7 +500,7 @@ class Extremes(CurveWatch):
                 extremes[f"{name}_lost"] = Extremum(value, t, *who)
         return extremes
 
-    def _take_first(self, kind: int, values: Floats, times: Floats, who: Ints) -> None:
+    def _take_least(self, kind: int, values: Floats, times: Floats, who: Ints) -> None:
         """Take the least of the agents' values into account; of equal ones, the first in time."""
         if len(who) and (value := float(values.min())) < self.worst[kind]:
             i = int(np.where(values == value, times, np.inf).argmin())
@@ -519,7 +519,7 @@ class Extremes(CurveWatch):
         return extremes
 
 
-def _halves(t: float, h: float, points: Floats) -> tuple[Floats, Floats]:
+def _halve_step(t: float, h: float, points: Floats) -> tuple[Floats, Floats]:
     """Starts and lengths (2, 2) [s], and control points (2, 5, n), of both halves of a step with points (5, n)."""
     knots = (records.KNOTS + [[0.0], [1.0]]) / 2.0
     clock = np.array([[t, 0.5 * h], [t + 0.5 * h, 0.5 * h]])
@@ -555,6 +555,6 @@ def steps_in_world(clock: Floats, points: Floats, problem: Problem) -> tuple[Flo
     return clock, both.transpose(0, 3, 2, 4, 1).reshape(-1, n, 6, 5)
 
 
-def _rows(state: records.IntegratorState, steps: ArrayLike) -> Ints:
+def _trail_rows(state: records.IntegratorState, steps: ArrayLike) -> Ints:
     """Rows (S,) of the trail that hold some of the steps in it (S,), which are numbered from 0."""
     return (state.count[records.FIRST_ROW] + np.asarray(steps)) % len(state.trail.clock)

@@ -20,7 +20,7 @@ from rigidfleet.kernel.problem import TRACKING, External, Motion, workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
-from rigidfleet.planning.disturbances import disturbance
+from rigidfleet.planning.disturbances import mission_disturbance
 from rigidfleet.planning.legs import Leg, state_at_start
 from rigidfleet.planning.losses import Answer, answer_to, legs_from
 from rigidfleet.planning.plan import PhasePlan, plan_phase
@@ -43,7 +43,7 @@ from rigidfleet.simulation.point_phase import PointPhase
 from rigidfleet.simulation.recording import Piece, assemble_result
 from rigidfleet.simulation.sampled_phase import FleetState, SampledPhase
 from rigidfleet.simulation.sampling import Sampling, requested_times
-from rigidfleet.solids.records import join
+from rigidfleet.solids.records import join_solids
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class Progress:
 _timed: deque[tuple[Mission, Mission]] = deque(maxlen=8)
 
 
-def _with_times(mission: Mission) -> Mission:
+def _fill_in_times(mission: Mission) -> Mission:
     """A mission with its times known."""
     if (timed := next((timed for own, timed in tuple(_timed) if own is mission), None)) is None:
         timed = complete_times(mission)
@@ -230,7 +230,7 @@ class Flight:
         ``sampler`` chooses the times to record (`rigidfleet.simulation.sampling`); ``flips`` allows a formation to
         flip over.
         """
-        self.mission = mission = _with_times(as_mission(mission))
+        self.mission = mission = _fill_in_times(as_mission(mission))
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
         for name, function in (
@@ -267,7 +267,7 @@ class Flight:
             FleetState(mission, self._push.max_step, agent) if mission.vehicle_models else None
         )
         # Vehicles meet their disturbances in their own equations of motion.
-        self._disturbance = disturbance(mission) if self._vehicles is None else None
+        self._disturbance = mission_disturbance(mission) if self._vehicles is None else None
         self._extremes = Extremes(mission)
         self._workspaces = cache(workspace)  # phases of one size fly in the same memory
         self._active: ActivePhase | None = None
@@ -317,7 +317,7 @@ class Flight:
     def pose(self) -> Pose:
         """Pose of the virtual body: its reference if slots are tracked, otherwise the agents' own frame."""
         active = self.under_way()
-        active.evaluate()
+        active.evaluate_law_now()
         w, plan = active.workspace, active.plan
         if plan.problem.control.kind == TRACKING:
             return Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
@@ -353,7 +353,7 @@ class Flight:
             return False
         by_hand = phase is not None
         if phase is None:
-            if self._active is not None and not self._active.flew:
+            if self._active is not None and not self._active.has_flown:
                 raise FlightError(
                     f"nothing of phase '{self.phases[-1].name}' has been flown: call advance before the next begin"
                 )
@@ -368,7 +368,7 @@ class Flight:
             self._following += 1
         elif isinstance(phase, Mapping):  # no phase yet
             # Checked first: a phase under way goes on where it has errors.
-            flown = len(self.phases) - (self._active is not None and not self._active.flew)
+            flown = len(self.phases) - (self._active is not None and not self._active.has_flown)
             phase = phase_of_table(
                 self.mission, self._phases_begun[:flown], self.phases[:flown], phase
             )
@@ -378,7 +378,7 @@ class Flight:
         if self.mission.on_loss == "continue" or not self._is_current_of_route(phase):
             self._state_now.blend = None
         if self._phases_begun:
-            self._report(phase, planning=True)
+            self._report_progress(phase, planning=True)
         try:
             leg = timed_leg(self.mission, phase, self._state_now, len(self._phases_begun))
             plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
@@ -389,7 +389,7 @@ class Flight:
                 fly = partial(SampledPhase, vehicles=self._vehicles)
             self._active = fly(
                 len(self.phases), plan, extremes=self._extremes, external=self.external,
-                sampler=self.sampler, pieces=self.pieces, pause=lambda _: self._report(phase),
+                sampler=self.sampler, pieces=self.pieces, pause=lambda _: self._report_progress(phase),
                 workspaces=self._workspaces,
             )  # fmt: skip
         except MissionError as error:
@@ -407,7 +407,7 @@ class Flight:
         # Nobody asks a controller of the user's to follow the plan.
         record = PhaseRecord(
             phase.name, phase.kind, phase.control, plan.formation, plan.start, plan.start,
-            settled=None if phase.settle is None else False, target=plan.target,
+            settled=None if phase.settle is None else False, target=plan.target_record,
             planned=plan.certificate._asdict() if self._built_in and plan.certificate else None,
         )  # fmt: skip
         self.phases.append(record)
@@ -435,7 +435,7 @@ class Flight:
         if duration is not None and not duration > 0.0:
             raise ValueError(f"the duration must be positive [s], not {duration!r}")
         plan = active.plan
-        active.stop = min(math.inf if duration is None else active.t + duration, self._loss_ahead())
+        active.stop = min(math.inf if duration is None else active.t + duration, self._next_loss())
         t_end, settle = min(active.stop, plan.t_end), plan.phase.settle
         try:
             if settle is None:
@@ -455,9 +455,9 @@ class Flight:
     def arrive(self) -> bool:
         """End the phase under way if it is over; return whether it goes on, as `advance` does."""
         active = self.under_way()
-        plan, settle, loss = active.plan, active.plan.phase.settle, self._loss_ahead()
+        plan, settle, loss = active.plan, active.plan.phase.settle, self._next_loss()
         self.phases[-1].t_end = active.t
-        if active.has_settled or active.over:
+        if active.has_settled or active.is_over:
             settled = active.has_settled
             self._leave_phase()
             if settle is not None and not settled:
@@ -499,7 +499,7 @@ class Flight:
             feedback = problem.feedback._replace(
                 arrival=t, r=start.r, v=start.v, T1=np.ascontiguousarray(start.T), omega=start.omega
             )
-            active.steer(problem._replace(feedback=feedback, external=external))
+            active.continue_by_hand(problem._replace(feedback=feedback, external=external))
             return
         (r, v, a_end), (phi, omega, alpha_end) = end, turn
         zero = np.zeros(3)
@@ -510,7 +510,7 @@ class Flight:
         times = np.array([t, t + h])
         pieces = np.ascontiguousarray(lqr.quintic_pieces(times, x, x_dot, x_ddot))
         motion = Motion(times, pieces, np.ascontiguousarray(start.T))
-        active.steer(problem._replace(motion=motion, external=external))
+        active.continue_by_hand(problem._replace(motion=motion, external=external))
 
     def finish(self, ending: str = "") -> Result:
         """End the flight; return its record.
@@ -548,7 +548,7 @@ class Flight:
         """The network of the vehicles, and what was sent on it; None without one."""
         return None if self._vehicles is None else self._vehicles.network
 
-    def lose(self, loss: float) -> None:
+    def lose_messages(self, loss: float) -> None:
         """Let links lose a share of the messages from now on, if there are any."""
         if self._vehicles is not None:
             self._vehicles.lose_messages(loss)
@@ -564,7 +564,7 @@ class Flight:
         """The record of samples, of the mission's own phases or of the phases ``flown`` instead."""
         active = self._active
         if active is not None:  # the flight can go on
-            active.watch(last=True)
+            active.search_extremes(last=True)
             self.phases[-1].extremes = self._extremes.extremes_so_far()
         mission, phases = self.mission, self.phases
         if flown is not None:
@@ -598,18 +598,18 @@ class Flight:
         `mission` has them from now on, its text has not.
         """
         if self._active is not None:
-            self._active.watch(last=True)
+            self._active.search_extremes(last=True)
         self.mission = self.mission.model_copy(update={"obstacles": tuple(obstacles)})
         self._extremes.use_obstacles(obstacles)
         vehicles = self._vehicles
         if vehicles is not None and vehicles.avoidance is not None:
-            solids = join([thing.solid for thing in obstacles])
+            solids = join_solids([thing.solid for thing in obstacles])
             vehicles.avoidance = with_obstacles(vehicles.avoidance, solids)
 
     def contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far, with vehicle and obstacle, or None."""
         if self._active is not None:
-            self._active.watch(last=True)
+            self._active.search_extremes(last=True)
         return self._extremes.deepest_contact()
 
     # -- inside -----------------------------------------------------------------------------------
@@ -638,7 +638,7 @@ class Flight:
             raise FlightError(f"no phase is under way: {why}")
         return self._active
 
-    def _loss_ahead(self) -> float:
+    def _next_loss(self) -> float:
         """Time [s] of the loss that ends the phase under way; infinity if none does.
 
         Phases begun by hand go on: who began them decides.
@@ -683,13 +683,15 @@ class Flight:
         if active is None:
             return
         self._active = None
-        if not active.flew:  # as if it had never begun: if it is the mission's, it is still to come
+        if (
+            not active.has_flown
+        ):  # as if it had never begun: if it is the mission's, it is still to come
             self._following -= self._is_current_of_route(self._phases_begun[-1])
             del self.phases[-1], self._phases_begun[-1], self._plans[-1:]
             return
-        if not (active.has_settled or active.over or abandoned):
+        if not (active.has_settled or active.is_over or abandoned):
             self._cut.add(len(self.phases) - 1)
-        active.watch(last=True)
+        active.search_extremes(last=True)
         record = self.phases[-1]
         record.extremes = self._extremes.end_phase()
         record.abandoned = abandoned
@@ -697,7 +699,7 @@ class Flight:
             None if self._built_in else self.controller is None or active.control_calls > 0
         )
         if active.event_delay > 0.0:
-            record.target = active.plan.target
+            record.target = active.plan.target_record
         record.settled = None if abandoned else active.has_settled
         active.count_work()
         self._count += active.counted
@@ -713,7 +715,9 @@ class Flight:
             record.target = {"time": came[-1]["time"], "through": came} if came else None
         if changed and record.target is not None and record.target["time"] > record.t_end:
             record.target = None
-        if not abandoned and (active.has_settled or active.over or active.t >= active.plan.arrival):
+        if not abandoned and (
+            active.has_settled or active.is_over or active.t >= active.plan.arrival
+        ):
             record.stay = active.plan.stay_target(active.t)
 
     def _check_frame(self, plan: PhasePlan) -> None:
@@ -733,7 +737,7 @@ class Flight:
                 ' control = "tracking"'
             )
 
-    def _report(self, phase: Phase, *, planning: bool = False) -> None:
+    def _report_progress(self, phase: Phase, *, planning: bool = False) -> None:
         wall = clock.perf_counter()
         at_once = planning or not self.pieces
         if self.progress is not None and (at_once or wall - self._reported > _REPORT):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet.kernel.avoidance import KNOWN, AvoidanceArrays, needed_rate
+from rigidfleet.kernel.avoidance import KNOWN, AvoidanceArrays, needed_gap_acceleration
 from rigidfleet.kernel.problem import SHAPE, SQUARED, Motion, Problem
 from rigidfleet.math import lqr, series
 from rigidfleet.mission import Mission
@@ -22,16 +22,16 @@ from rigidfleet.mission.schema import Avoidance as Settings
 from rigidfleet.planning.body_layer import (
     NEAR,
     Detour,
-    greatest_acceleration,
+    greatest_point_acceleration,
     nearest_accelerations,
-    rigid_rows,
-    scale_rows,
+    rigid_motion_rows,
+    scale_bound_rows,
 )
 from rigidfleet.planning.derivatives import body_series, slot_derivatives, slot_series
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock, delay_by, time_derivatives
 from rigidfleet.result import Extremum
-from rigidfleet.solids.distance import outward_normal, own_axes, signed_distance
+from rigidfleet.solids.distance import in_own_axes, outward_normal, signed_distance
 from rigidfleet.typing import Floats, Ints
 
 #: Time for which a decision holds [s].
@@ -119,8 +119,8 @@ class Leader:
     def lead(self, t: float, end: float, a: AvoidanceArrays) -> Problem | None:
         """Decide at t [s] until ``end`` [s]; returns the problem to fly, or None if it is the one flown already."""
         h = end - t
-        acts = self._acts(t + h)
-        self.clock.aim(*(self._target(t, a) if acts and self.settings.clock else (1.0, np.inf)))
+        acts = self._can_lead(t + h)
+        self.clock.set_aim(*(self._target(t, a) if acts and self.settings.clock else (1.0, np.inf)))
         accelerations = (
             self._detour_rates(t, a) if acts and self.settings.body else self.deviation.decay()
         )
@@ -144,7 +144,7 @@ class Leader:
             self.steered = t if self.steered is None else self.steered
         return problem
 
-    def rate(self, time: Floats) -> Floats:
+    def clock_rate(self, time: Floats) -> Floats:
         """Rate of the clock at times (K,) [s] of the period flown last."""
         if self.now is None:
             return np.ones(len(time))
@@ -169,7 +169,7 @@ class Leader:
 
     # -- the clock ----------------------------------------------------------------------------------------
 
-    def _acts(self, t: float) -> bool:
+    def _can_lead(self, t: float) -> bool:
         """Whether a reference can be led at t [s]: blends of squared distances are those of no slots."""
         reference = self.problem.reference
         return reference.kind != SQUARED or t - self.clock.delay >= reference.t0 + reference.T_b
@@ -215,7 +215,7 @@ class Leader:
         for o in seen:
             x, bound = a.sight.track[o], a.sight.bound[o]
             away = r - (x[:3] + ahead[:, None] * x[3:])[:, None]
-            room = signed_distance(*own_axes(*away.transpose(2, 0, 1), o, a.solids), o, a.solids)
+            room = signed_distance(*in_own_axes(*away.transpose(2, 0, 1), o, a.solids), o, a.solids)
             room = room - (a.reach + a.spare) - (bound[0] + bound[1] / 3.0 * ahead)[:, None]
             if (worst := float(room.min())) < least:
                 least, self.who = worst, int(np.unravel_index(room.argmin(), room.shape)[1])
@@ -268,16 +268,16 @@ class Leader:
         B = series.from_derivatives(time_derivatives(series.derivatives(axes), rates))
         ends = [self.deviation.state_after(each, accelerations, h) for each in dt]
         moves, turns, grows = (
-            np.stack(each, axis=-1) for each in zip(*(e.series() for e in ends), strict=True)
+            np.stack(each, axis=-1) for each in zip(*(e.taylor_series() for e in ends), strict=True)
         )
         x += series.derivatives(moves)
         grown = series.product(series.from_derivatives(p), grows[:, None, None])
         p = series.derivatives(grown)
         B = series.product(np.moveaxis(turns, -1, 1), np.moveaxis(B, -1, 1), np.matmul)
-        phi = series.derivatives(series.rotation_vector(B[0, 0].T @ B))
+        phi = series.derivatives(series.rotation_vector_series(B[0, 0].T @ B))
         channels = np.concatenate([x.transpose(0, 2, 1), phi], axis=2)  # (3, ends, 6)
         polynomials = Motion(times, _polynomials(times, channels), np.ascontiguousarray(B[0, 0].T))
-        late, scaled = delay_by(problem, self.clock.delay).reference, self._any_scale(ends)
+        late, scaled = delay_by(problem, self.clock.delay).reference, self._is_any_scaled(ends)
         if not (p[1:].any() or scaled):
             return problem._replace(motion=polynomials, reference=late)
         ways = _polynomials(times, p.transpose(0, 3, 2, 1))
@@ -287,7 +287,7 @@ class Leader:
         )
 
     @staticmethod
-    def _any_scale(ends: list[Detour]) -> bool:
+    def _is_any_scaled(ends: list[Detour]) -> bool:
         return any(np.any(e.scale != [1.0, 0.0, 0.0]) for e in ends)
 
     # -- the body -----------------------------------------------------------------------------------------
@@ -299,7 +299,7 @@ class Leader:
         moving = np.flatnonzero((sight.moves == 1) & (sight.known == KNOWN))
         if not len(moving) and self.deviation.is_none:
             return accelerations
-        r, v, rise, arms = self._slots(t)
+        r, v, rise, arms = self._slot_motion(t)
         z = self.deviation.scale[0]
         limit = _STEERING * float(a.b.min())
         cones = (self._cones(o, r, v, rise, a) for o in moving)
@@ -316,8 +316,8 @@ class Leader:
         barriers = (self._barriers(o, r, v, rise, a) for o in np.flatnonzero(sight.moves == 0))
         more, least, _ = self._rows_of(barriers, arms, limit)
         rows, needed = np.vstack([rows, more]), np.append(needed, least)
-        if self._any_scale([self.deviation]) or self._scalable:
-            more, least = scale_rows(self.deviation)
+        if self._is_any_scaled([self.deviation]) or self._is_scalable:
+            more, least = scale_bound_rows(self.deviation)
             rows, needed = np.vstack([rows, more]), np.append(needed, least)
         else:
             rows[:, 6] = 0.0
@@ -327,11 +327,11 @@ class Leader:
         if wanted is None:  # no motion of the body helps: single vehicles have to give way
             return accelerations
         change = wanted - accelerations
-        greatest = greatest_acceleration(change, arms, z)
+        greatest = greatest_point_acceleration(change, arms, z)
         return accelerations + min(1.0, limit / max(greatest, 1e-12)) * change
 
     @cached_property
-    def _scalable(self) -> bool:
+    def _is_scalable(self) -> bool:
         """Whether slots may be scaled: their distances are those of the edges."""
         plan = self.plan
         if plan.slots is None:
@@ -340,7 +340,7 @@ class Leader:
         d = np.linalg.norm(plan.slots[i] - plan.slots[j], axis=1)
         return np.allclose(d, plan.distances, rtol=0.0, atol=1e-6)
 
-    def _slots(self, t: float) -> tuple[Floats, Floats, Floats, Floats]:
+    def _slot_motion(self, t: float) -> tuple[Floats, Floats, Floats, Floats]:
         """Slots (N, 3), velocities, accelerations without those of the deviation, and arms from the body's origin."""
         tau = np.array([t - self.clock.delay])
         cm, axes = body_series(self.problem.motion, tau, 3)
@@ -351,7 +351,7 @@ class Leader:
             time_derivatives(series.derivatives(slots), rates)[..., 0].transpose(0, 2, 1)
             - c[:, None]
         )
-        Q = series.derivatives(self.deviation.series()[1])
+        Q = series.derivatives(self.deviation.taylor_series()[1])
         z, z1, _ = self.deviation.scale
         x = self.deviation.x
         # Without the second derivatives that are asked for
@@ -371,7 +371,7 @@ class Leader:
         parts = [(np.zeros((0, 7)), np.zeros(0), np.zeros(0, dtype=int))]
         for normal, needed in barriers:
             some = np.flatnonzero(needed > -limit)
-            rows = rigid_rows(normal[some], arms[some], self.deviation.scale[0])
+            rows = rigid_motion_rows(normal[some], arms[some], self.deviation.scale[0])
             parts.append((rows, needed[some], some))
         rows, needed, who = (np.concatenate(each) for each in zip(*parts, strict=True))
         return rows, needed, who
@@ -405,7 +405,7 @@ class Leader:
     ) -> tuple[Floats, Floats]:
         """Barriers of slots against obstacle o, which stands still; see `_cones`."""
         solids = a.solids
-        at = own_axes(*r.T, o, solids)
+        at = in_own_axes(*r.T, o, solids)
         away = signed_distance(*at, o, solids)
         normal = np.stack(np.broadcast_arrays(*outward_normal(*at, o, solids)), axis=1)
         if solids.turned[o]:
@@ -413,5 +413,5 @@ class Leader:
         rate = (normal * v).sum(axis=1)
         gap = away - a.reach - a.spare - np.maximum(0.0, -rate) * (self.period + a.lag)
         strength = _STEERING * a.share * a.b
-        needed = needed_rate(gap, rate, 0.0, strength, _EARLIER * a.rate)
+        needed = needed_gap_acceleration(gap, rate, 0.0, strength, _EARLIER * a.rate)
         return normal, needed - (normal * rise).sum(axis=1)

@@ -187,7 +187,7 @@ def _answer_of(answer: Any) -> tuple[Floats, Any, int]:
         what = f"as its force {error}"
         raise ValueError(what, "return a force (3,) [N], weight included, and a message") from None
     try:
-        return f, *((None, 0) if message is None else plain_copy(message))
+        return f, *((None, 0) if message is None else immutable_copy(message))
     except TypeError as error:
         remedy = (
             f"it contains {error}; send numbers, arrays, tuples or dictionaries of these, or None"
@@ -195,7 +195,7 @@ def _answer_of(answer: Any) -> tuple[Floats, Any, int]:
         raise ValueError("a message that cannot be sent", remedy) from None
 
 
-def plain_copy(x: Any) -> tuple[Any, int]:
+def immutable_copy(x: Any) -> tuple[Any, int]:
     """A copy of numbers, arrays, and tuples, lists and dictionaries of these that nobody can change, and its numbers.
 
     Raises
@@ -210,10 +210,10 @@ def plain_copy(x: Any) -> tuple[Any, int]:
     if isinstance(x, int | float | np.floating | np.integer | np.bool_):
         return x.item() if isinstance(x, np.generic) else x, 1
     if isinstance(x, tuple | list):
-        parts = [plain_copy(part) for part in x]
+        parts = [immutable_copy(part) for part in x]
         return tuple(part for part, _ in parts), sum(size for _, size in parts)
     if isinstance(x, Mapping):
-        named = {name: plain_copy(part) for name, part in x.items()}
+        named = {name: immutable_copy(part) for name, part in x.items()}
         whole = {name: part for name, (part, _) in named.items()}
         return MappingProxyType(whole), sum(size for _, size in named.values())
     raise TypeError(

@@ -50,8 +50,8 @@ class PointPhase(ActivePhase):
         """Begin to integrate at a state (n,) and time [s]."""
         super().begin(y, t)
         plan = self.plan
-        self.aside = plan.large and self.external is None
-        self.state = self.extremes.begin(
+        self.aside = plan.is_large and self.external is None
+        self.state = self.extremes.begin_monitoring(
             y, t, len(plan.edges), rtol=plan.integrator.rtol, atol=plan.tolerances
         )
         if self.steps:  # after a loss
@@ -64,7 +64,7 @@ class PointPhase(ActivePhase):
 
     def fly(self, problem: Problem, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way."""
-        stretch = self.prepare(problem, self.sample_times(t_end))
+        stretch = self.prepare_stretch(problem, self.sample_times(t_end))
         state, fresh = self.state, stretch.fresh
         status = records.PAUSED
         go_on = native.Integration(
@@ -80,30 +80,30 @@ class PointPhase(ActivePhase):
                     self.steps = min(_STEPS, max(1, int(self.steps * min(_PAUSE / took, 10.0))))
                 fresh = False
                 if self.external is not None:
-                    self.external.check()
+                    self.external.raise_user_error()
                 self.raise_errors()
                 full = state.count[records.TRAILED] == len(state.trail.clock)
                 if self.aside:
                     full = self.extremes.free_steps(state) < 1
                 if status == records.PAUSED or full:
-                    self.watch(last=False)
+                    self.search_extremes(last=False)
                 self.pause(self.t)
                 if status == records.PAUSED and self.has_stalled():
                     break
         finally:
-            self.record(stretch)
+            self.record_stretch(stretch)
         if status != records.FINISHED:
             collapsed = status == records.COLLAPSED
             own_force = self.external is not None
             raise StoppedError(diagnose(self, own_force=own_force, collapsed=collapsed))
 
-    def watch(self, *, last: bool) -> None:
+    def search_extremes(self, *, last: bool) -> None:
         """Search the steps flown for extremes.
 
         In a large formation, the search takes as long as the flight: another thread does it meanwhile. The user's
         force, which may not be ready for two threads, is asked by one.
         """
-        self.extremes.wait()
+        self.extremes.wait_for_steps()
         if not self.state.count[records.TRAILED] or self.flown is None:
             return
         work = self.workspace if self.solver is None else self.solver.solver_for_thread.workspace
@@ -112,12 +112,12 @@ class PointPhase(ActivePhase):
         else:
             self.extremes.hand_over(self.flown, work, self.state)
 
-    def prepare(self, problem: Problem, times: Floats) -> Stretch:
+    def prepare_stretch(self, problem: Problem, times: Floats) -> Stretch:
         """Prepare to integrate a problem from now on, and to record the states at some times (K,) [s]."""
         evaluations = self.state.count[records.EVALUATIONS]
         fresh = evaluations == 0 or problem is not self.plan.problem
         if fresh:
-            self.watch(last=True)
+            self.search_extremes(last=True)
             self.flown = problem
             if self.solver is not None:  # a solver keeps state: the monitor has its own
                 self.flown = problem_with_solver(self.solver.solver_for_thread, problem)
@@ -126,7 +126,7 @@ class PointPhase(ActivePhase):
         self.state.count[records.SAMPLES] = 0
         return Stretch(problem, times, samples, fresh, math.nextafter(self.t, math.inf))
 
-    def record(self, stretch: Stretch) -> None:
+    def record_stretch(self, stretch: Stretch) -> None:
         """Store the samples of what was integrated since `prepare`."""
         state, (problem, times, samples, _, first) = self.state, stretch
         done = int(state.count[records.SAMPLES])
@@ -134,7 +134,7 @@ class PointPhase(ActivePhase):
         if tried and len(times) and times[0] <= first:
             samples[0], done = state.y, 1  # no step was possible: record the start alone
         if done:
-            self._record(problem, times[:done], samples[:done])
+            self._store_samples(problem, times[:done], samples[:done])
 
     def has_stalled(self) -> bool:
         """Whether the phase takes far more steps than its duration explains."""
@@ -154,7 +154,7 @@ class PointPhase(ActivePhase):
         if self.solver is not None:
             packing.forget_last_packed()
 
-    def _record(self, problem: Problem, times: Floats, samples: Floats) -> None:
+    def _store_samples(self, problem: Problem, times: Floats, samples: Floats) -> None:
         """Store the samples; forces and references at them are evaluated when they are asked for."""
         plan = self.plan
         n, m = len(plan.masses), len(plan.edges)
@@ -166,4 +166,4 @@ class PointPhase(ActivePhase):
         if plan.frame is not None:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
-        self.store(times, source, samples[:, 6 * n : 6 * n + m], frame)
+        self.store_piece(times, source, samples[:, 6 * n : 6 * n + m], frame)

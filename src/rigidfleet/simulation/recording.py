@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidfleet._common.arrays import arrays_equal
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.measured import Measured, measurement_of
+from rigidfleet.kernel.measured import Measured, measurement_arrays
 from rigidfleet.kernel.problem import workspace
 from rigidfleet.kernel.records import Record, new_record
 from rigidfleet.math import attitude as att
@@ -104,12 +104,12 @@ class Unevaluated(NamedTuple):
             return r, v
         q, *cm = np.split(self.y[:, 6 * n + m :], [4, 7], axis=1)
         T = att.dcm_from_quaternion(q / np.linalg.norm(q, axis=1, keepdims=True))
-        return _in_world(r, T, cm[0]), _in_world(v, T, cm[1])
+        return _points_to_world(r, T, cm[0]), _points_to_world(v, T, cm[1])
 
     def evaluate(self, times: Floats, work: Workspace) -> Record:
         """Forces and references at the samples, times (K,) [s]."""
         out = new_record(len(times), len(self.problem.vehicles.m), len(self.problem.graph.edges))
-        self.evaluate_into(native.pack_anew(out), 0, times, work)
+        self.evaluate_into(native.pack_uncached(out), 0, times, work)
         return out
 
     def evaluate_into(self, out: native.Packed, first: int, times: Floats, work: Workspace) -> None:
@@ -121,7 +121,7 @@ class Unevaluated(NamedTuple):
                 getattr(out.of, name)[first : first + len(times)] = getattr(of_phase, name)
 
 
-def _in_world(x: Floats, T: Floats, origin: Floats) -> Floats:
+def _points_to_world(x: Floats, T: Floats, origin: Floats) -> Floats:
     """origin + T^T x of vectors x (K, N, 3) in body axes, world -> body T (K, 3, 3), and origin (K, 3)."""
     return origin[:, None] + x @ T
 
@@ -148,7 +148,7 @@ class Piece:
             return self.source
         n = len(self.source.problem.vehicles.m)
         out = new_record(len(self.time), n, len(self.edges))
-        self.record_into(native.pack_anew(out), 0)
+        self.record_into(native.pack_uncached(out), 0)
         return out
 
     def record_into(
@@ -168,9 +168,9 @@ class Piece:
             planned = problem_with_solver(solver, source.planned)
             own = source.problem is source.planned
             problem = planned if own else problem_with_solver(solver, source.problem)
-            renewed = source._replace(packed=native.pack_anew(problem), planned=planned)
+            renewed = source._replace(packed=native.pack_uncached(problem), planned=planned)
             renewed.evaluate_into(out, first, self.time, solver.workspace)
-            solver.check()
+            solver.raise_pending_error()
         else:
             source.evaluate_into(out, first, self.time, workspace_of(source.planned, make=make))
 
@@ -191,7 +191,7 @@ def assemble_result(
     """
     pieces = [p for p in pieces if len(p.time)]
     time = np.concatenate([p.time for p in pieces])
-    flown = _of_vehicles(pieces)
+    flown = _vehicle_samples(pieces)
     tau = flown.tau if flown is not None and flown.tau.size else None
     avoided = [piece.layers for piece in pieces if piece.layers is not None]
     layers = _concatenate_samples(avoided) if avoided else None
@@ -213,7 +213,7 @@ def assemble_result(
         now |= distances(mission, worst, r, time)
     counts = [len(p.time) for p in pieces]
     later += [
-        (LATER, partial(_references, mission, [(p.time, p.followed) for p in pieces], tau)),
+        (LATER, partial(_slot_references, mission, [(p.time, p.followed) for p in pieces], tau)),
         (("singular_value",), partial(_singular_values, r, counts, [p.edges for p in pieces])),
         (("mission_text",), partial(recorded_text, mission)),
     ]
@@ -253,7 +253,7 @@ def _forces_and_references(
     """Forces and references at all samples, and what is measured of them."""
     d = mission.disturbances
     disturbed = flown is not None or d is not None
-    record = _record(pieces, mission.n_agents, mission.edges, disturbed=disturbed)
+    record = _join_records(pieces, mission.n_agents, mission.edges, disturbed=disturbed)
     measured = _measure(mission, pieces, time, record)
     thrust, motion, r_ref = measured.thrust, record.motion, record.r_ref
     if flown is not None:
@@ -328,7 +328,7 @@ def distances(
     return dict(zip(CLOSE, arrays, strict=True))
 
 
-def _references(
+def _slot_references(
     mission: Mission, pieces: Sequence[tuple[Floats, FollowedReferences]], tau: Floats | None
 ) -> dict[str, Floats]:
     """Derivatives of the slots and the yaw of each vehicle, of pieces of a flight; NaN where no slots are tracked.
@@ -390,7 +390,7 @@ def _yaw_of_turn(
     return slots_and_yaw(reference, motion, since, yaw, turn)[1][:2, :, 1:].transpose(2, 0, 1)
 
 
-def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:
+def _vehicle_samples(pieces: Sequence[Piece]) -> VehicleSamples | None:
     """The samples of all pieces; None if point masses flew."""
     samples = [piece.vehicles for piece in pieces if piece.vehicles is not None]
     if not samples:
@@ -426,7 +426,7 @@ def _measure(mission: Mission, pieces: Sequence[Piece], time: Floats, record: Re
     """
     agents = mission.agents
     n = mission.n_agents
-    measured = measurement_of(
+    measured = measurement_arrays(
         n, len(mission.edges), len(time), time=time,
         start=np.cumsum([0, *(len(p.time) for p in pieces)]),
         attached=np.array([p.attached for p in pieces]), framed=mission.body_frame is not None,
@@ -435,24 +435,24 @@ def _measure(mission: Mission, pieces: Sequence[Piece], time: Floats, record: Re
         r=record.r, v=record.v, f_u=record.f_u, f_C=record.f_C, p=record.p, T_ref=record.T_ref,
         frame=np.concatenate([p.frame for p in pieces]),
     )  # fmt: skip
-    native.measure(measured)
+    native.measure_samples(measured)
     return measured
 
 
-def _record(pieces: Sequence[Piece], n: int, edges: Ints, *, disturbed: bool) -> Record:
+def _join_records(pieces: Sequence[Piece], n: int, edges: Ints, *, disturbed: bool) -> Record:
     """Forces and references at all samples, of the pieces one after the other; NaN while an edge is not active."""
     count, end = sum(len(p.time) for p in pieces), 0
     out = new_record(count, n, len(edges), disturbed=disturbed)
-    whole, make = native.pack_anew(out), cache(workspace)
+    whole, make = native.pack_uncached(out), cache(workspace)
     for piece in pieces:
         begin, end = end, end + len(piece.time)
-        places = _columns(piece.edges, edges)
+        places = _edge_columns(piece.edges, edges)
         if isinstance(places, slice):
             piece.record_into(whole, begin, make)
             continue
         size = count, len(piece.edges)
         own = out._replace(**{name: np.empty(size) for name in _EDGEWISE})
-        piece.record_into(native.pack_anew(own), begin, make)
+        piece.record_into(native.pack_uncached(own), begin, make)
         for name in _EDGEWISE:
             rows = getattr(out, name)[begin:end]
             rows.fill(np.nan)
@@ -465,12 +465,12 @@ def _constraint_integral(pieces: Sequence[Piece], edges: Ints) -> Floats:
     rows = []
     for piece in pieces:
         full = np.full((len(piece.time), len(edges)), np.nan)
-        full[:, _columns(piece.edges, edges)] = piece.integral
+        full[:, _edge_columns(piece.edges, edges)] = piece.integral
         rows.append(full)
     return np.concatenate(rows)
 
 
-def _columns(some: Ints, edges: Ints) -> Ints | slice:
+def _edge_columns(some: Ints, edges: Ints) -> Ints | slice:
     """Indices of some edges among all edges, (m, 2) both."""
     if arrays_equal(some, edges):
         return slice(None)

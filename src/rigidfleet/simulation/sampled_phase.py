@@ -26,10 +26,10 @@ from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.vehicles import (
     TickTables,
     YawTurn,
-    first_yaw,
+    initial_yaw,
     loss_transitions,
     sampled_flight,
-    turn_from,
+    yaw_turn_from,
 )
 from rigidfleet.planning.virtual_clock import delay_by
 from rigidfleet.result import Extremum
@@ -39,7 +39,7 @@ from rigidfleet.simulation.callbacks import (
     Command,
     Observation,
     article_and_kind,
-    checked_command,
+    check_command,
 )
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.leading import Leader, layers
@@ -76,7 +76,7 @@ class FleetState:
         self.tables = TickTables(mission, self.flight)
         self.avoidance = avoidance_in_flight(mission, self.flight)
         start = mission.fleet
-        self.yaw = first_yaw(mission)  # asked of each vehicle at the last switch, and its rate
+        self.yaw = initial_yaw(mission)  # asked of each vehicle at the last switch, and its rate
         yaw = float(self.yaw[0, 0])
         self.S = fleet.hover_states(self.flight.vehicles, start.position, start.velocity, yaw)
         self.state: fleet.SampledState | None = None  # of the phase before
@@ -124,7 +124,7 @@ class SampledPhase(ActivePhase):
             period = self.flight.every * self.flight.steps * self.flight.h
             self.leader = Leader(vehicles.layers, plan, period)
             self.leader.deviation.scale = vehicles.scale
-        self.turn = turn_from(plan.problem, plan.start, vehicles.tables.yaw, vehicles.yaw)
+        self.turn = yaw_turn_from(plan.problem, plan.start, vehicles.tables.yaw, vehicles.yaw)
         #: When own clocks were last looked at, and by how much they were late then [s].
         self.late = plan.start, 0.0
         self.slowed: tuple[float, int] | None = None  # when they first waited [s], and for whom
@@ -136,7 +136,7 @@ class SampledPhase(ActivePhase):
         plan, fleet_state = self.plan, self.vehicles
         n, m = len(plan.masses), len(plan.edges)
         rtol, atol = plan.integrator.rtol, plan.tolerances
-        self.state = self.extremes.begin(y, t, m, rtol=rtol, atol=atol, states=6 * n)
+        self.state = self.extremes.begin_monitoring(y, t, m, rtol=rtol, atol=atol, states=6 * n)
         lost = self.flight.vehicles._replace(lost=self.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
@@ -198,17 +198,17 @@ class SampledPhase(ActivePhase):
         if not self.flight.clocks.own:
             return 0.0
         tau, ticks = self.sampled.tau[~self.flight.vehicles.lost], self.sampled.count[fleet.TICKS]
-        since = self.t - max(ticks - 1, 0) * self._tick  # clocks run on between ticks
+        since = self.t - max(ticks - 1, 0) * self._tick_duration  # clocks run on between ticks
         return float(-(tau[:, OFF] + since * (tau[:, RATE] - 1.0)).mean())
 
     @property
-    def _tick(self) -> float:
+    def _tick_duration(self) -> float:
         return self.flight.steps * self.flight.h
 
     def _delay_events(self) -> None:
         """Move the events of the plan that have not come yet by what own clocks are late."""
         plan, t, (t_before, before) = self.plan, self.t, self.late
-        late = max(0, round(self.lateness / self._tick)) * self._tick
+        late = max(0, round(self.lateness / self._tick_duration)) * self._tick_duration
         self.late = t, late
 
         def postponed_time(time: float) -> float:
@@ -223,7 +223,7 @@ class SampledPhase(ActivePhase):
         if self.slowed is None and (self.sampled.tau[:, PACE] < _SLOWED).any():
             self.slowed = t, int(self.sampled.tau[:, WORST].argmax())
 
-    def steer(self, problem: Problem) -> None:
+    def continue_by_hand(self, problem: Problem) -> None:
         """Take up a problem that was made by hand: the layers above the barriers then rest."""
         self.steered = True
         if self.leader is not None:
@@ -235,9 +235,9 @@ class SampledPhase(ActivePhase):
         tables, t = self.vehicles.tables, self.t
         if tables.yaw.kind == "along":
             now = tables.yaw_at(self.plan.problem, t, self.turn)
-            self.turn = turn_from(problem, t, tables.yaw, now)
+            self.turn = yaw_turn_from(problem, t, tables.yaw, now)
         self.by_pieces = True
-        super().steer(problem)
+        super().continue_by_hand(problem)
 
     def observe(self) -> Observation:
         """What a controller sees: states of now or, with noise, as the law knows them at a tick and until the next."""
@@ -256,7 +256,7 @@ class SampledPhase(ActivePhase):
     def _measure_if_due(self) -> None:
         """Measure what the law will know if a tick is due."""
         self._supply_tables()
-        now = fleet.segment(len(self.sampled.S), len(self.plan.edges), self.t, max_steps=0)
+        now = fleet.sampled_segment(len(self.sampled.S), len(self.plan.edges), self.t, max_steps=0)
         fly_ticks(self.plan.problem, self.workspace, self.flight, self.sampled, now)
 
     def views(self) -> list[View | None]:
@@ -275,7 +275,7 @@ class SampledPhase(ActivePhase):
     def problem_under(self, command: Command) -> Problem:
         """The plan's problem, beside the thrust and attitude, or the speeds of rotors, that a controller commands."""
         t = self.t
-        arrays = checked_command(command, len(self.lost), t)
+        arrays = check_command(command, len(self.lost), t)
         why = ""
         if self.flight.vehicles.point.any():
             why = "but some agents are points; return forces [N]"
@@ -291,7 +291,7 @@ class SampledPhase(ActivePhase):
         self.flight = self.flight._replace(commands=commands)
         return self.plan.problem._replace()  # not the plan's own: a loss has to keep it held
 
-    def watch(self, *, last: bool) -> None:
+    def search_extremes(self, *, last: bool) -> None:
         """Search the steps flown for extremes."""
         self.extremes.avoidance = self.vehicles.avoidance
         if self.leader is not None:
@@ -327,7 +327,7 @@ class SampledPhase(ActivePhase):
         network, laws = self.vehicles.flight.network, self.vehicles.laws
         if network is not self.flight.network:
             self.flight = self.flight._replace(network=network)
-        call = fleet.segment(n, m, t_end, times, _STEPS, links=len(network.links))
+        call = fleet.sampled_segment(n, m, t_end, times, _STEPS, links=len(network.links))
         sampled.count[fleet.SAMPLES] = 0
         looked = laws is not None and laws.has_views(problem, sampled)
         status = records.ASKS if looked else records.PAUSED
@@ -344,9 +344,9 @@ class SampledPhase(ActivePhase):
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
                     self.state.clock[records.TIME] = t_end
                 if self.external is not None:
-                    self.external.check()
+                    self.external.raise_user_error()
                 self.raise_errors()
-                self.watch(last=False)
+                self.search_extremes(last=False)
                 self.pause(self.t)
         finally:
             done = int(sampled.count[fleet.SAMPLES])
@@ -355,7 +355,7 @@ class SampledPhase(ActivePhase):
             )
             done = done if finite.all() else int(finite.argmin())
             if done:
-                self._keep(problem, call, done)
+                self._store_flown_samples(problem, call, done)
         if self.flight.clocks.own:
             self._delay_events()
         if not np.isfinite(sampled.S).all():
@@ -412,7 +412,7 @@ class SampledPhase(ActivePhase):
         self.vehicles.yaw = self.vehicles.tables.yaw_at(plan.problem, t - self.lateness, self.turn)
         if self.flight.clocks.own:
             # The next phase is planned from now on: its times are later by as much, for all clocks alike.
-            late = round(self.lateness / self._tick) * self._tick
+            late = round(self.lateness / self._tick_duration) * self._tick_duration
             mail = self.sampled.mail
             for off in (self.sampled.tau[:, OFF], mail.heard[:, CLOCK], mail.post[..., CLOCK]):
                 np.add(off, late, out=off)  # also in messages
@@ -427,7 +427,7 @@ class SampledPhase(ActivePhase):
 
     # -- recording --------------------------------------------------------------------------------
 
-    def _keep(self, problem: Problem, call: fleet.SampledSegment, done: int) -> None:
+    def _store_flown_samples(self, problem: Problem, call: fleet.SampledSegment, done: int) -> None:
         """Store samples: states and forces as flown, references and constraints of the plan."""
         plan = self.plan
         S, times = call.S[:done], call.times[:done]
@@ -444,8 +444,10 @@ class SampledPhase(ActivePhase):
         else:
             planned = native.record(plan.problem, self.workspace, times, y)
             tau = tau[..., :0]
-        out, kept = _as_flown(planned, call, done, self.flight, problem, tau)
-        self.store(times, out, call.integral[:done], frame, kept, self._layers(call, done))
+        out, kept = _flown_record(planned, call, done, self.flight, problem, tau)
+        self.store_piece(
+            times, out, call.integral[:done], frame, kept, self._layer_samples(call, done)
+        )
 
     def _record_by_own_clocks(self, times: Floats, y: Floats, tau: Floats) -> Record:
         """A record at the mean of own clocks ``tau`` (K, N, 3), with forces of now, and the slot by each clock."""
@@ -460,17 +462,17 @@ class SampledPhase(ActivePhase):
             np.multiply(x, rate[:, None], out=x)
         return planned
 
-    def _layers(self, call: fleet.SampledSegment, done: int) -> LayerSamples | None:
+    def _layer_samples(self, call: fleet.SampledSegment, done: int) -> LayerSamples | None:
         """Samples of what avoidance did."""
         if self.vehicles.avoidance is None:
             return None
         times, acting = call.times[:done], call.layers[:done]
         if self.leader is None:
             return LayerSamples(np.ones(done), np.zeros((done, 3)), acting)
-        return LayerSamples(self.leader.rate(times), self.leader.displacement(times), acting)
+        return LayerSamples(self.leader.clock_rate(times), self.leader.displacement(times), acting)
 
 
-def _as_flown(
+def _flown_record(
     planned: Record,
     call: fleet.SampledSegment,
     done: int,

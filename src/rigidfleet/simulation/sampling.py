@@ -56,12 +56,12 @@ def requested_times(times: ArrayLike, end: float) -> Floats:
     ValueError
         A time lies outside the mission.
     """
-    t = _sort_once(as_numbers("times to record [s]", times))
+    t = _sort_distinct(as_numbers("times to record [s]", times))
     if not (len(t) and t[0] >= 0.0 and t[-1] <= end * (1.0 + 1e-12)):
         raise ValueError(f"times to record must lie between 0 and the mission's end, {end:g} s")
-    return t if t[-1] <= end else _sort_once(np.minimum(t, end))
+    return t if t[-1] <= end else _sort_distinct(np.minimum(t, end))
 
 
-def _sort_once(t: Floats) -> Floats:
+def _sort_distinct(t: Floats) -> Floats:
     """Times (K,) sorted, each once; a copy, of which a flight records parts."""
     return t.copy() if t.ndim == 1 and (t[1:] > t[:-1]).all() else np.unique(t)

@@ -27,7 +27,7 @@ def workspace_and_solver(
 
     ``make`` makes a workspace, or returns one that the phase before has used.
     """
-    if not plan.large:
+    if not plan.is_large:
         work = workspace_of(plan.problem, make=make)
         work.T[:] = work.T_ref[:] = np.eye(3)
         return work, None
@@ -40,8 +40,8 @@ def workspace_and_solver(
         steps = solvers.elimination_steps(len(points), edges)
         order = None if steps is None else ordering.prepare_order(steps, plan.problem.graph.edges)
     axes = plan.problem.has_frame or plan.problem.law.k_def > 0.0
-    dissect = cache(partial(solvers.dissection, points, edges))
-    solver = large_solver(plan.problem, Setup(order, dissect, *plan.residual(), axes))
+    dissect = cache(partial(solvers.dissection_order, points, edges))
+    solver = large_solver(plan.problem, Setup(order, dissect, *plan.residual_tolerances(), axes))
     plan.problem = problem_with_solver(solver, plan.problem)
     return solver.workspace, solver
 
@@ -80,16 +80,16 @@ def first_step(plan: PhasePlan, work: Workspace, state: records.IntegratorState)
     t, y = float(state.clock[records.TIME]), state.y
     scale = plan.tolerances + state.rtol * np.abs(y)
 
-    def size(x: Floats) -> float:
+    def scaled_rms(x: Floats) -> float:
         return float(np.sqrt(np.mean((x / scale) ** 2)))
 
     longest = plan.t_end - plan.start
     slope, later = np.empty_like(y), np.empty_like(y)
     native.closed_loop(t, y, slope, problem, work)
-    first = size(slope)
-    h = min(0.01 * size(y) / max(first, 1e-300), longest)
+    first = scaled_rms(slope)
+    h = min(0.01 * scaled_rms(y) / max(first, 1e-300), longest)
     native.closed_loop(t + h, y + h * slope, later, problem, work)
-    steepest = max(first, size(later - slope) / h)
+    steepest = max(first, scaled_rms(later - slope) / h)
     if not 0.0 < steepest < math.inf:
         return float(state.clock[records.NEXT_STEP])
     return min(100.0 * h, (0.01 / steepest) ** 0.2, longest)

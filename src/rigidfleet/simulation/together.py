@@ -59,7 +59,7 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
                 from rigidfleet.kernel.engine import batch
 
                 vector = batch.Vector(_fill_lanes([x.plan.problem.disturbance for x in active]))
-            if not _fly(points, vector):
+            if not _fly_in_common_steps(points, vector):
                 return [simulate(mission) for mission in missions]
             for flight in flights:
                 flight.arrive()
@@ -72,14 +72,14 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
 def _can_share_steps(active: Sequence[ActivePhase]) -> bool:
     """Whether phases differ in nothing but numbers, so that they can share steps."""
     first = _sharing_key(active[0])
-    if not all(_is_plain(phase) and _sharing_key(phase) == first for phase in active):
+    if not all(_can_fly_together(phase) and _sharing_key(phase) == first for phase in active):
         return False
     from rigidfleet.kernel.engine import batch
 
     return batch.fit_together([phase.plan.problem for phase in active])
 
 
-def _is_plain(phase: ActivePhase) -> bool:
+def _can_fly_together(phase: ActivePhase) -> bool:
     """Whether a phase has a given duration, without losses, calls of users' functions, fences and people."""
     plan = phase.plan
     return (
@@ -99,13 +99,13 @@ def _sharing_key(phase: ActivePhase) -> tuple[object, ...]:
     return *times, plan.integrator.rtol, len(phase.state.y), extremes.directed
 
 
-def _fly(active: Sequence[PointPhase], vector: batch.Vector) -> bool:
+def _fly_in_common_steps(active: Sequence[PointPhase], vector: batch.Vector) -> bool:
     """Fly phases to their end in common steps and record them; return whether they came there."""
     from rigidfleet.kernel.engine.tracer import UnfitError
 
     t_end = active[0].plan.t_end
     times = active[0].sample_times(t_end)
-    stretches = [phase.prepare(phase.plan.problem, times) for phase in active]
+    stretches = [phase.prepare_stretch(phase.plan.problem, times) for phase in active]
     try:
         vector.begin(
             _fill_lanes([stretch.problem for stretch in stretches]),
@@ -121,11 +121,11 @@ def _fly(active: Sequence[PointPhase], vector: batch.Vector) -> bool:
         status = vector(_STEPS)
         if status == records.PAUSED:
             for phase in active:
-                phase.watch(last=False)
+                phase.search_extremes(last=False)
             if active[0].has_stalled():
                 return False
     for phase, stretch in zip(active, stretches, strict=True):
-        phase.record(stretch)
+        phase.record_stretch(stretch)
     return status == records.FINISHED
 
 

@@ -27,9 +27,9 @@ from rigidfleet.math.piecewise import (
     SAME,
     Piecewise,
     common_knots,
-    join,
+    join_curves,
     pad,
-    piece_at,
+    piece_index,
     refine_knots,
 )
 from rigidfleet.mission import Mission, as_mission
@@ -124,8 +124,8 @@ def trajectories(
     MissionError
         A limit is invalid.
     """
-    t = _array("time", time, None)
-    states = [_array("position", position, len(t), None, 3)]
+    t = _check_numbers("time", time, None)
+    states = [_check_numbers("position", position, len(t), None, 3)]
     shape, lacks = states[0].shape, ""
     for what, values in (("velocity", velocity), ("acceleration", acceleration), ("jerk", jerk)):
         if values is None:
@@ -135,7 +135,7 @@ def trajectories(
                 f"without {lacks}, {what} says nothing. Give {lacks}, or leave {what} out."
             )
         else:
-            states.append(_array(what, values, *shape))
+            states.append(_check_numbers(what, values, *shape))
     if len(t) < 2:
         raise ResultError("a trajectory needs two samples or more.")
     if not (np.diff(t) > 0).all():
@@ -147,20 +147,20 @@ def trajectories(
     first, knots = sample_intervals(t)
     if not len(first):
         raise ResultError(f"all samples are at {t[0]:g} s; a trajectory lasts.")
-    yaws = np.full(shape[:2], np.nan) if yaw is None else _array("yaw", yaw, *shape[:2])
+    yaws = np.full(shape[:2], np.nan) if yaw is None else _check_numbers("yaw", yaw, *shape[:2])
     x, angle = np.stack(states), np.unwrap(yaws, axis=0)[None, ..., None]
     way, turned = (Piecewise.of_ends(knots, y[:, first], y[:, first + 1]) for y in (x, angle))
     how = NAMES[2 * len(states) - 1]
     if cubic and len(states) == 1:
         _refuse_jumps(way)
         way, how = Piecewise.cubic_spline(knots, way.at(knots)), ASSUMED["cubic"]
-    return of_curve(
+    return result_of_curve(
         way.stack(turned), how,
         mission=mission, separation=separation, limits=limits, radius=radius, ground=ground, name=name,
     )  # fmt: skip
 
 
-def _array(name: str, values: ArrayLike, *sizes: int | None) -> Floats:
+def _check_numbers(name: str, values: ArrayLike, *sizes: int | None) -> Floats:
     """Finite numbers of these sizes, of which None is any but none."""
     try:
         x = np.asarray(values, dtype=np.float64)
@@ -245,7 +245,7 @@ def judging_mission(
     return Mission.from_plain(data | more, "the limits")
 
 
-def of_curve(
+def result_of_curve(
     curve: Piecewise,
     interpolation: str,
     *,
@@ -272,7 +272,7 @@ def of_curve(
         A limit is invalid.
     """
     zero = 0.0 if 0.0 <= curve.time[0] <= _CLOCK else float(curve.time[0])
-    curve, spans = curve.later(-zero), np.subtract(spans, zero).tolist()
+    curve, spans = curve.shift_time(-zero), np.subtract(spans, zero).tolist()
     _refuse_jumps(curve)
     time, n, powers = curve.time, curve.pieces.shape[1], curve.pieces.shape[-1]
     span = float(time[-1] - time[0])
@@ -297,7 +297,7 @@ def of_curve(
     record.extremes.update(watch.end_phase())
     watch.complete_phases([record])
     record.extremes.update(fastest)
-    at, state, yaws = _samples(curve, parts)
+    at, state, yaws = _sample_curve(curve, parts)
     if powers < 3:  # lines turn at once at samples
         state[2:] = np.nan
     facts = {"interpolation": interpolation, "names": list(names), "spans": spans, "clock": zero}
@@ -313,7 +313,7 @@ def of_curve(
     return result_of(mission, [record], known, facts)
 
 
-def of_curves(read: Trajectories, **judged: Any) -> Result:
+def result_of_trajectories(read: Trajectories, **judged: Any) -> Result:
     """A result of trajectories that were read; before and after its own times, a vehicle stays or is not judged.
 
     Parameters
@@ -323,7 +323,7 @@ def of_curves(read: Trajectories, **judged: Any) -> Result:
     Raises
     ------
     ResultError, MissionError
-        As for `of_curve`.
+        As for `result_of_curve`.
     """
     if read.own_clocks:
         raise ResultError(
@@ -334,8 +334,8 @@ def of_curves(read: Trajectories, **judged: Any) -> Result:
     _refuse_too_many(len(curves), len(knots))
     ends = knots[np.searchsorted(knots, [curve.time[[0, -1]] - 2.0 * SAME for curve in curves])]
     spans = ends.tolist() if read.away and np.ptp(ends, axis=0).any() else ()
-    result = of_curve(
-        join(curves), read.assumed, names=read.names, spans=spans, since=read.since, **judged
+    result = result_of_curve(
+        join_curves(curves), read.assumed, names=read.names, spans=spans, since=read.since, **judged
     )
     result.statistics |= {"notes": list(read.notes), "read": list(read.read)}
     return result
@@ -373,7 +373,7 @@ def _refuse_jumps(curve: Piecewise) -> None:
         )
 
 
-def _samples(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats]:
+def _sample_curve(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats]:
     """Times (K,) [s], position to jerk (4, K, N, 3), and yaw and its rate (2, K, N), at ends of equal parts of pieces.
 
     Where states jump, there are two samples. Where the rate of yaw jumps, it is the mean.
@@ -385,7 +385,7 @@ def _samples(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats]:
     ends = np.append(np.zeros(pieces - 1, dtype=np.bool_), True)  # which pieces have a sample there
     turn = np.zeros((pieces + 1, n))  # half of the jumps of yaw's rate
     for k in range(0, pieces - 1, together):
-        jumps = curve.part(k, k + together + 1).jumps(4)
+        jumps = curve.slice_pieces(k, k + together + 1).jumps(4)
         turn[k + 1 : k + 1 + jumps.shape[1]] = 0.5 * jumps[1, ..., 3]
         jumps = np.abs(jumps[..., :3]) > 1e-9 * scale[:, None, None, None]
         ends[k : k + jumps.shape[1]] |= jumps.any(axis=(0, 2, 3))
@@ -408,7 +408,7 @@ def _samples(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats]:
     return at, state, yaw
 
 
-def _split(time: Floats, parts: Ints) -> Floats:
+def _split_intervals(time: Floats, parts: Ints) -> Floats:
     """Knots (sum of the parts + 1,) [s] that cut each interval between times (K + 1,) into equal parts (K,)."""
     k = np.repeat(np.arange(len(parts)), parts)
     share = (np.arange(len(k)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[k]
@@ -418,18 +418,18 @@ def _split(time: Floats, parts: Ints) -> Floats:
 def watch_curve(
     watch: CurveWatch, curve: Piecewise, grid: Floats, spans: Sequence[Sequence[float]]
 ) -> dict[str, Extremum]:
-    """Watch a curve (K, N, 3 or more, P), see `_watch`, and return its greatest accelerations."""
+    """Watch a curve (K, N, 3 or more, P), see `_watch_positions`, and return its greatest accelerations."""
     fastest: dict[str, Extremum] = {}
     together = max(1, _TOGETHER // (4 * curve.pieces.shape[1] * curve.pieces.shape[-1]))
     for k in range(0, len(curve.pieces), together):  # in blocks, to save memory
-        block = curve.part(k, k + together)
+        block = curve.slice_pieces(k, k + together)
         way = Piecewise(block.time, pad(block.pieces[:, :, :3], 2))
-        _watch(watch, way, grid, spans)
+        _watch_positions(watch, way, grid, spans)
         _take_accelerations(fastest, way, directed=watch.directed)
     return fastest
 
 
-def _watch(
+def _watch_positions(
     watch: CurveWatch, way: Piecewise, grid: Floats, spans: Sequence[Sequence[float]]
 ) -> None:
     """Watch positions (K, N, 3, P) in steps that end at times of a grid, within `_CLOSE` of curves of fourth degree.
@@ -437,9 +437,9 @@ def _watch(
     Vehicles are watched in their ``spans`` alone, if there are any.
     """
     knots = refine_knots(way.time, grid, 1e-6)
-    k = piece_at(way.time, 0.5 * (knots[:-1] + knots[1:]))
+    k = piece_index(way.time, 0.5 * (knots[:-1] + knots[1:]))
     share = np.diff(knots) / np.diff(way.time)[k]
-    knots = _split(knots, np.ceil(_parts(way)[k] * share - 1e-9).astype(np.int64))
+    knots = _split_intervals(knots, np.ceil(_count_parts(way)[k] * share - 1e-9).astype(np.int64))
     together = max(1, _TOGETHER // (30 * way.pieces.shape[1]))
     here = presence(0.5 * (knots[:-1] + knots[1:]), spans, way.pieces.shape[1] if spans else 1)
     change = np.flatnonzero((here[1:] != here[:-1]).any(axis=1)) + 1
@@ -450,13 +450,13 @@ def _watch(
         if not here[first].any():
             continue
         part = way.refine(knots[first : last + 1])
-        at = [x.at_shares(records.KNOTS) for x in (part, part.rate())]
+        at = [x.at_shares(records.KNOTS) for x in (part, part.derivative_curve())]
         points = np.concatenate([x.reshape(*x.shape[:2], -1) for x in at], axis=2)
         clock = np.column_stack([part.time[:-1], np.diff(part.time)])
         watch.take_curves(clock, records.FROM_KNOTS @ points)
 
 
-def _parts(way: Piecewise) -> Ints:
+def _count_parts(way: Piecewise) -> Ints:
     """Into how many parts each piece (K, N, 3, P) is cut, to be within `_CLOSE` of curves of fourth degree.
 
     About any place of a piece of width h, power p has a coefficient of at most sum_j C(j, p) |c_j| h^(j - p). What is
@@ -473,7 +473,7 @@ def _take_accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed
     n = curve.pieces.shape[1]
     if curve.pieces.shape[-1] < 3:
         return
-    points = curve.rate().rate().control_points()
+    points = curve.derivative_curve().derivative_curve().control_points()
     points = points.reshape(-1, *points.shape[2:])
     for way in SIZES if directed else ("",):
         name = f"{way}_acceleration".lstrip("_")
@@ -491,7 +491,7 @@ def result_of(
     statistics: dict[str, Any],
     **ending: Any,
 ) -> Result:
-    """A result of what is known of a flight, with NaN for the rest; ``statistics`` have the spans of `of_curve`."""
+    """A result of what is known of a flight, NaN for the rest; ``statistics`` have the spans of `result_of_curve`."""
     time, r = known["time"], known["position"]
     k, n = r.shape[:2]
     left = presence(time, statistics["spans"], n)

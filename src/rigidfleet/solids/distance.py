@@ -242,7 +242,7 @@ def outward_normal(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     return i / away, j / away, k / away
 
 
-def displacement(t: Numbers, b: int, s: Any) -> Any:
+def solid_displacement(t: Numbers, b: int, s: Any) -> Any:
     """Displacement [m] of solid b at time t [s]: straight between waypoints, at rest before and after them."""
     first, last = s.first[b, 3], s.last[b, 3]
     x = y = z = 0.0 * t
@@ -261,7 +261,7 @@ def is_present(t: Numbers, b: int, s: Any) -> Any:
     return (t >= s.there[b, 0]) & (t <= s.there[b, 1])
 
 
-def own_axes(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+def in_own_axes(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     """Coordinates in the axes of solid b, without its motion, of a point in the world."""
     if s.turned[b] == 0:
         return x, y, z
@@ -284,8 +284,8 @@ def is_below(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
 
     Nobody stands on what moves.
     """
-    u, v, w = own_axes(x, y, z, b, s)
-    i, j, k = own_axes(x, y, z - _LOWERED, b, s)
+    u, v, w = in_own_axes(x, y, z, b, s)
+    i, j, k = in_own_axes(x, y, z - _LOWERED, b, s)
     still = s.last[b, 3] == s.first[b, 3]
     nearer = signed_distance(u, v, w, b, s) - signed_distance(i, j, k, b, s)
     return (nearer >= STEEP * _LOWERED) & still
@@ -331,5 +331,5 @@ def height_below(x: Numbers, y: Numbers, z: Numbers, s: Any) -> Numbers:
 ELEMENTWISE = (
     choose, box_distance, box_normal, cylinder_distance, cylinder_normal,
     segment_to_point, edge_side, facet_normal, triangle_to_point, height_map_point, surface_to_point, is_inside,
-    signed_distance, outward_normal, displacement, is_present, own_axes, is_below, height_range, height_below,
+    signed_distance, outward_normal, solid_displacement, is_present, in_own_axes, is_below, height_range, height_below,
 )  # fmt: skip

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet.solids.distance import displacement
-from rigidfleet.solids.records import CYLINDER, HEIGHTS, HULL, Solids, corners
+from rigidfleet.solids.distance import solid_displacement
+from rigidfleet.solids.records import CYLINDER, HEIGHTS, HULL, Solids, box_corners
 from rigidfleet.typing import Floats
 
 #: Number of sides of a circle.
@@ -23,11 +23,11 @@ class Outline(NamedTuple):
     lines: Floats  # (L, 2, 3) [m]
 
 
-def outline(solid: Solids) -> Outline:
+def outline_of_solid(solid: Solids) -> Outline:
     """The surface of a finite solid, alone in its record, without its motion; world axes."""
     size, kind = solid.size[0], solid.kind[0]
     if kind == HEIGHTS:
-        own = _terrain(solid)
+        own = _height_map_outline(solid)
     elif kind == HULL:
         own = Outline(solid.triangles, _creases(solid.triangles))
     elif kind == CYLINDER:
@@ -38,18 +38,18 @@ def outline(solid: Solids) -> Outline:
         angle = np.linspace(-np.pi / 2, np.pi / 2, _SIDES // 2 + 1)
         own = _revolve(solid.rounding[0] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     else:
-        own = _box(size)
+        own = _box_outline(size)
     T, o = solid.turn[0], solid.origin[0]
     return Outline(own.triangles @ T + o, own.lines @ T + o)
 
 
 def displacements_at(solid: Solids, times: Floats) -> Floats:
     """Displacements (K, 3) [m] of a solid, alone in its record, at times (K,) [s]."""
-    return np.stack(displacement(times, 0, solid), axis=-1)
+    return np.stack(solid_displacement(times, 0, solid), axis=-1)
 
 
-def _box(size: Floats) -> Outline:
-    corner = corners(size[:3], size[3:])
+def _box_outline(size: Floats) -> Outline:
+    corner = box_corners(size[:3], size[3:])
     faces = [(1, 5, 7, 3), (0, 2, 6, 4), (0, 4, 5, 1), (2, 3, 7, 6), (4, 6, 7, 5), (0, 1, 3, 2)]
     triangles = corner[[[a, b, c] for a, b, c, _ in faces] + [[a, c, d] for a, _, c, d in faces]]
     edges = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
@@ -92,7 +92,7 @@ def _creases(triangles: Floats) -> Floats:
     return np.array(kept).reshape(-1, 2, 3)
 
 
-def _terrain(solid: Solids) -> Outline:
+def _height_map_outline(solid: Solids) -> Outline:
     """A height map's surface, its sides down to the lowest height, and some of the lines of its grid."""
     z, size = solid.heights.reshape(solid.grid[0]), solid.size[0]
     x, y = (np.linspace(0.0, size[3 + k], n) for k, n in enumerate(z.shape))

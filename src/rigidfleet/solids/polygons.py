@@ -45,7 +45,7 @@ class Region(NamedTuple):
         parts = np.split(x, range(some, len(x), some))
         return np.concatenate([self._distance(self._edge_to_points(part), part) for part in parts])
 
-    def depth(self, points: Floats, *, outside: bool) -> tuple[Floats, Floats]:
+    def depths_of_curves(self, points: Floats, *, outside: bool) -> tuple[Floats, Floats]:
         """By how much curves are inside (or ``outside``) at their middles (M,) [m], and an upper bound (M,) all along.
 
         A curve lies in the hull of its control points (M, 3, P). Where it stays on the one side, the nearest edge is at
@@ -120,14 +120,14 @@ def edges_cross(edges: Floats) -> bool:
     """Whether two of the edges (E, 2, 2) cross, or overlap, at more than an end that they share."""
     a, b = edges[:, 0], edges[:, 1]
 
-    def turn(p: Floats, q: Floats, r: Floats) -> Floats:
+    def signed_area(p: Floats, q: Floats, r: Floats) -> Floats:
         (u, v), (x, y) = np.moveaxis(q - p, -1, 0), np.moveaxis(r - p, -1, 0)
         return u * y - v * x
 
     for k in range(len(edges) - 1):
         p, q = a[k + 1 :], b[k + 1 :]
-        one, other = turn(a[k], b[k], p), turn(a[k], b[k], q)
-        here, there = turn(p, q, a[k]), turn(p, q, b[k])
+        one, other = signed_area(a[k], b[k], p), signed_area(a[k], b[k], q)
+        here, there = signed_area(p, q, a[k]), signed_area(p, q, b[k])
         crossed = (one * other < 0.0) & (here * there < 0.0)
         along = b[k] - a[k]
         spans = np.sort(np.stack([(p - a[k]) @ along, (q - a[k]) @ along]), axis=0) / (

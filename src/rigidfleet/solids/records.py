@@ -137,7 +137,7 @@ def height_map(corner: ArrayLike, spacing: ArrayLike, heights: ArrayLike, base: 
     top = np.stack([i * x, j * y, z], axis=-1)
     low = top.copy()
     low[..., 2] = base
-    faces = _cells(top)
+    faces = _surface_triangles(top)
     for rim, under in (
         (top[0], low[0]), (top[-1, ::-1], low[-1, ::-1]), (top[::-1, 0], low[::-1, 0]), (top[:, -1], low[:, -1]),
     ):  # fmt: skip
@@ -150,7 +150,7 @@ def height_map(corner: ArrayLike, spacing: ArrayLike, heights: ArrayLike, base: 
     return Form(HEIGHTS, origin, _UPRIGHT, size, triangles=np.concatenate(faces), heights=z)
 
 
-def _cells(top: Floats) -> list[Floats]:
+def _surface_triangles(top: Floats) -> list[Floats]:
     """Triangles of the surface of a height map, whose grid points are (I, J, 3); corners anticlockwise from above."""
     a, b, c, d = (
         x.reshape(-1, 3) for x in (top[:-1, :-1], top[1:, :-1], top[1:, 1:], top[:-1, 1:])
@@ -170,7 +170,7 @@ def one_solid(
     """
     times = np.asarray(times, dtype=float)
     ways = np.asarray(ways, dtype=float).reshape(-1, 3)
-    triangles, nodes, after, leaf = _tree(form.triangles)
+    triangles, nodes, after, leaf = _bounding_tree(form.triangles)
     last = [len(nodes), len(triangles), form.heights.size, len(times)]
     turned = bool(np.any(form.origin) or np.any(form.turn != _UPRIGHT))
     return Solids(
@@ -181,7 +181,7 @@ def one_solid(
     )  # fmt: skip
 
 
-def join(parts: Sequence[Solids]) -> Solids:
+def join_solids(parts: Sequence[Solids]) -> Solids:
     """All solids of several records in one."""
     if not parts:
         return one_solid(half_space(0.0))._replace(kind=np.zeros(0, dtype=np.int64))
@@ -201,12 +201,12 @@ def join(parts: Sequence[Solids]) -> Solids:
     )
 
 
-def corners(low: ArrayLike, high: ArrayLike) -> Floats:
+def box_corners(low: ArrayLike, high: ArrayLike) -> Floats:
     """Corners (8, 3) of a box from ``low`` to ``high`` (3,): those with the lowest x first, and so on."""
     return np.array(list(product(*np.transpose([low, high]))))
 
 
-def extent(solid: Solids) -> Floats:
+def swept_extent(solid: Solids) -> Floats:
     """Lowest and highest corner (2, 3) [m] of the space that a solid, alone in its record, ever takes."""
     size, turn = solid.size[0], solid.turn[0]
     if solid.kind[0] == CYLINDER:
@@ -214,7 +214,7 @@ def extent(solid: Solids) -> Floats:
         reach = half * np.abs(turn[2]) + radius * np.sqrt(np.maximum(1.0 - turn[2] ** 2, 0.0))
         low, high = -reach, reach
     elif solid.turned[0]:
-        points = corners(size[:3], size[3:]) @ turn  # from own axes to the world's
+        points = box_corners(size[:3], size[3:]) @ turn  # from own axes to the world's
         low, high = points.min(axis=0), points.max(axis=0)
     else:
         low, high = size[:3], size[3:]
@@ -224,7 +224,7 @@ def extent(solid: Solids) -> Floats:
     return ends
 
 
-def _tree(triangles: Floats) -> tuple[Floats, Floats, Ints, Ints]:
+def _bounding_tree(triangles: Floats) -> tuple[Floats, Floats, Ints, Ints]:
     """Triangles (T, 3, 3) in the order of a tree's leaves, and its nodes, depth first: corners, successors, leaves."""
     low, high = triangles.min(axis=1), triangles.max(axis=1)
     centre, order = (low + high) / 2, np.arange(len(triangles))

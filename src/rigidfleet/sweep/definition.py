@@ -36,7 +36,7 @@ from rigidfleet.sweep.variation import (
     NotationError,
     Variation,
     is_number,
-    parse_line,
+    parse_variation,
 )
 
 #: Remedy if final states cannot be evaluated alone.
@@ -86,7 +86,7 @@ class SweepHeader(Part):
     drill: Drill | None = key("faults of the day, in turn, instead of what varies: [drill]")
 
     @property
-    def own(self) -> tuple[str, str]:
+    def own_law(self) -> tuple[str, str]:
         """Key of the user's law and its name; the name is "" if the laws of the mission fly."""
         return ("agent", self.agent) if self.agent else ("controller", self.controller)
 
@@ -101,7 +101,7 @@ class SweepColumn:
     @property
     def name(self) -> str:
         """Path of the number, counted from 1."""
-        return keypaths.name_of(self.keys)
+        return keypaths.path_of_keys(self.keys)
 
     @property
     def in_words(self) -> bool:
@@ -181,7 +181,7 @@ class Sweep:
         if isinstance(vary, str | bytes) or not isinstance(vary, Iterable):
             raise wrong_type("a list of variations", vary)
         data = {"mission": mission.name, "vary": list(vary), **keys}
-        variations, header = _Check(data, origin, mission).parts()
+        variations, header = _Check(data, origin, mission).variations_and_header()
         ending = "" if header.drill is None else "-drill"
         return cls(mission, variations, header, name or mission.name + ending)
 
@@ -216,7 +216,7 @@ class Sweep:
         if isinstance(own := data.get("vary", []), list):
             data["vary"] = [*own, *more]
         controllers.add_search_folder(path.parent)
-        variations, header = _Check(data, origin, mission).parts()
+        variations, header = _Check(data, origin, mission).variations_and_header()
         assert mission is not None  # otherwise the check has raised
         if header.drill:
             drill = header.drill.from_folder(path.parent)
@@ -234,12 +234,12 @@ class Sweep:
 
     def json(self) -> str:
         """Return the definition as JSON text, including the mission."""
-        return json.dumps(self._data(), ensure_ascii=False)
+        return json.dumps(self._definition_data(), ensure_ascii=False)
 
     @property
     def identity(self) -> dict[str, Any]:
         """Everything on which a run depends besides its number. The number of runs is not included: it may grow."""
-        data = self._data()
+        data = self._definition_data()
         del data["runs"], data["name"]
         files = {"code": self.law[1], "files": self.drill.digest if self.drill else ""}
         return data | {"version": __version__} | {key: x for key, x in files.items() if x}
@@ -253,7 +253,7 @@ class Sweep:
         RigidfleetError
             It cannot be imported.
         """
-        key, name = self.header.own
+        key, name = self.header.own_law
         if not name:
             return None, ""
         try:
@@ -264,7 +264,7 @@ class Sweep:
     @property
     def version(self) -> str:
         """What flies it: the version of rigidfleet, and the user's controller."""
-        name = self.header.own[1]
+        name = self.header.own_law[1]
         law = f" with {name} {self.law[1][:8]}" if name else ""
         return f"rigidfleet {__version__}{law}"
 
@@ -296,7 +296,7 @@ class Sweep:
     @cached_property
     def grid_sizes(self) -> dict[str | int, int]:
         """Number of values of each grid, by its column, or by its group if it has one; in order of first occurrence."""
-        grids = {_axis(c, k): c.variation.grid for k, c in enumerate(self.columns)}
+        grids = {_group_or_number(c, k): c.variation.grid for k, c in enumerate(self.columns)}
         return {axis: len(grid) for axis, grid in grids.items() if grid}
 
     def values(self, run: int) -> list[Any]:
@@ -308,7 +308,7 @@ class Sweep:
         for axis, size in reversed(self.grid_sizes.items()):  # the last grid varies fastest
             point, places[axis] = divmod(point, size)
         return [
-            grid[places[_axis(c, k)]]
+            grid[places[_group_or_number(c, k)]]
             if (grid := c.variation.grid)
             else c.variation.quantile(fractions.pop(0))
             for k, c in enumerate(self.columns)
@@ -374,7 +374,7 @@ class Sweep:
 
         return phase_spans(complete_times(self.mission))[-1][1]
 
-    def _data(self) -> dict[str, Any]:
+    def _definition_data(self) -> dict[str, Any]:
         return self.header.model_dump(exclude_defaults=True) | {
             "name": self.name,
             "mission": self.mission.text,
@@ -385,7 +385,7 @@ class Sweep:
         }
 
 
-def _axis(column: SweepColumn, k: int) -> str | int:
+def _group_or_number(column: SweepColumn, k: int) -> str | int:
     """What grids share that take their values together: their group, or the column's own number."""
     return getattr(column.variation, "group", "") or k
 
@@ -408,11 +408,11 @@ def apply_value(
     document: dict[str, Any], whole: Mapping[str, Any], column: SweepColumn, value: Any
 ) -> None:
     """Apply a value of a column to a document; all numbers at its place change alike."""
-    there = keypaths.flatten(look_up(whole, column.keys))
+    there = keypaths.flatten_lists(look_up(whole, column.keys))
     integral = all(isinstance(x, int) for x in there)
 
     def new_number(there: Any) -> Any:
-        new = column.variation.apply(there, value)
+        new = column.variation.apply_change(there, value)
         return round(new) if integral and math.isfinite(new) else new
 
     def new_value(there: Any) -> Any:
@@ -442,7 +442,7 @@ class _Check:
         self.whole = {} if mission is None else keypaths.whole_document(mission)
         self.lacked: list[tuple[int, SweepColumn]] = []
 
-    def parts(self) -> tuple[list[Variation], SweepHeader]:
+    def variations_and_header(self) -> tuple[list[Variation], SweepHeader]:
         """Variations and header.
 
         Raises
@@ -457,14 +457,14 @@ class _Check:
         own = {key: value for key, value in self.data.items() if key in SweepHeader.model_fields}
         header = self.collector.validate(SweepHeader, own, ())
         if "drill" not in self.data:
-            variations = self._variations(header)
+            variations = self._check_variations(header)
         else:
-            variations = [] if header is None else self._cases(header.drill or Drill())
+            variations = [] if header is None else self._drill_cases(header.drill or Drill())
         if self.collector.findings or header is None:
             raise SweepError(self.collector.findings)
         return variations, header
 
-    def _cases(self, drill: Drill) -> list[Variation]:
+    def _drill_cases(self, drill: Drill) -> list[Variation]:
         """The cases of a drill; nothing else varies."""
         for name, default in (("vary", []), ("evaluate", "flight")):
             if self.data.get(name, default) != default:
@@ -483,12 +483,12 @@ class _Check:
             self.add(("drill",), "has no magnitude", "give some, such as late = [1, 2]")
         return grids
 
-    def _variations(self, header: SweepHeader | None) -> list[Variation]:
+    def _check_variations(self, header: SweepHeader | None) -> list[Variation]:
         """What varies, by grids or distributions, and whether it suits the mission and the other keys."""
         by_final_states = header is not None and header.evaluate == "final"
         variations: list[Variation] = []
         for k, entry in enumerate(self.collector.tables("vary")):
-            variation = self._variation(k, entry)
+            variation = self._check_variation(k, entry)
             path = look_up(self.data, ("vary", k, "path"))
             if self.mission is not None and isinstance(path, str):
                 self._check_places(k, path, variation, starts=by_final_states)
@@ -500,8 +500,8 @@ class _Check:
                 self.add(("evaluate",), why, _WHOLE, "final")
         if self.mission is not None:
             self._check_values(self.mission)
-        if header is not None and header.own[1]:
-            self._check_own_law(*header.own, header)
+        if header is not None and header.own_law[1]:
+            self._check_own_law(*header.own_law, header)
         if "rate" in self.data and not self.data.get("controller"):
             self.add(("rate",), "is that of a controller", "give a controller, or remove rate")
         self._check_groups(variations)
@@ -513,12 +513,12 @@ class _Check:
             self.add(("runs",), "is missing", "give the number of runs; only a grid determines it")
         return variations
 
-    def _variation(self, k: int, entry: Any) -> Variation | None:
+    def _check_variation(self, k: int, entry: Any) -> Variation | None:
         """Check a variation by itself; None if it has errors."""
         where, before = ("vary", k), len(self.collector.findings)
         if isinstance(entry, str):
             try:
-                entry = self.data["vary"][k] = parse_line(entry)
+                entry = self.data["vary"][k] = parse_variation(entry)
             except NotationError as error:
                 self.add(where, error.problem, error.remedy)
                 return None
@@ -551,7 +551,7 @@ class _Check:
             if remedy := next(filter(None, (rename_hint(keys[-1], word) for keys in places)), ""):
                 self.add(("vary", k, "values"), "is no value of the mission format", remedy, word)
         for keys in places:
-            leaves = keypaths.flatten(look_up(self.whole, keys))
+            leaves = keypaths.flatten_lists(look_up(self.whole, keys))
             absent = any(x is None for x in leaves)
             table = next((x for x in leaves if isinstance(x, dict)), None)
             words = [x for x in leaves if not is_number(x)]

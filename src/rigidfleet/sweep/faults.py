@@ -21,7 +21,7 @@ import numpy as np
 from rigidfleet._common.quantities import MOTIONS
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.math import proximity
-from rigidfleet.math.piecewise import Piecewise, common_knots, join, pad, piece_at
+from rigidfleet.math.piecewise import Piecewise, common_knots, join_curves, pad, piece_index
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.obstacles import Ground
 from rigidfleet.mission.values import AgentNumber, Angle, Part, Positive, key
@@ -92,10 +92,10 @@ class Drill(Part):
     def from_folder(self, folder: Path) -> Drill:
         """The same, with files as seen from a folder; names of shipped missions stay."""
 
-        def whole(name: str) -> str:
+        def resolve_file(name: str) -> str:
             return name if name in mission_names() else str((folder / name).resolve())
 
-        named = {key: (*map(whole, getattr(self, key)),) for key in ("stale", "files")}
+        named = {key: (*map(resolve_file, getattr(self, key)),) for key in ("stale", "files")}
         return self.model_copy(update={key: x for key, x in named.items() if x})
 
 
@@ -126,7 +126,7 @@ def apply_fault(
     table = document[place] = {**document.get(place, {})}
     if fault == "wind":
         wind = np.array(table.get("wind", (0.0, 0.0, 0.0)))
-        wind[:2] += size * _heading(stream.uniform(0.0, _TURN))[0]
+        wind[:2] += size * _bearings(stream.uniform(0.0, _TURN))[0]
         table["wind"] = wind.tolist()
         return
     key, things = "agent", range(1, n + 1)
@@ -139,7 +139,7 @@ def apply_fault(
     table["lost"] = there + [{key: rest[k], "time": t} for k, t in zip(some, times, strict=True)]
 
 
-def _heading(angle: Any) -> Floats:
+def _bearings(angle: Any) -> Floats:
     """Unit vectors (S, 2) of bearings (S,) [rad], clockwise from y."""
     return np.column_stack([np.sin(angle), np.cos(angle)])
 
@@ -241,7 +241,7 @@ class Show:
         from rigidfleet.foreign.files import read_trajectories
         from rigidfleet.setpoints import ways_of
         from rigidfleet.simulation.flight import simulate
-        from rigidfleet.simulation.trajectories import NAMES, of_curves
+        from rigidfleet.simulation.trajectories import NAMES, result_of_trajectories
 
         if files:
             read = read_trajectories(files, spans="stand")
@@ -252,8 +252,8 @@ class Show:
             if {*read.names} == {*self.names}:
                 order = [read.names.index(name) for name in self.names]
                 read = read._replace(names=self.names, curves=tuple(read.curves[i] for i in order))
-            verdict = assess(of_curves(read, mission=mission))
-            return join(read.curves), read.assumed, verdict, read.names
+            verdict = assess(result_of_trajectories(read, mission=mission))
+            return join_curves(read.curves), read.assumed, verdict, read.names
         if mission.n_agents != self.n:
             raise RigidfleetError(
                 f"drill.stale: {mission.name} has {mission.n_agents} agents, and the show {self.n}. Give an earlier"
@@ -265,29 +265,29 @@ class Show:
             motion = result.motion(flown=True)
         return ways_of(motion, slice(None)), NAMES[7], assess(result), ()
 
-    def outcome(self, fault: GeometricFault) -> tuple[dict[str, float | None], str, str]:
+    def measure_fault(self, fault: GeometricFault) -> tuple[dict[str, float | None], str, str]:
         """What was measured of a fault, the checks that it fails, and the first of these in words."""
         from rigidfleet.assessment import assess
 
         # A show that is moved as a whole changes no distance between its vehicles.
         if fault.kind in SETUP and len(fault.who) == self.n and not self.bounded:
             return {}, "", ""
-        result, every = self.flight(fault)
+        result, every = self.flight_with_fault(fault)
         verdict = assess(result)
         failed = [check for check in verdict.checks if not check.passed]
         worst = {c.check: c.worst for c in verdict.checks if c.judged and c.check in METRICS}
         named = {k: x for k, x in enumerate(self.names) if x.removeprefix("agent ") != f"{k + 1}"}
         who = [f"{k + 1} ({named[k]})" if k in named else f"{k + 1}" for k in every.tolist()]
 
-        def in_fleet(match: re.Match[str]) -> str:
+        def renumber_in_fleet(match: re.Match[str]) -> str:
             return re.sub(r"\d+", lambda number: who[int(number[0]) - 1], match[0])
 
-        words = _AGENTS.sub(in_fleet, failed[0].message) if failed else ""
+        words = _AGENTS.sub(renumber_in_fleet, failed[0].message) if failed else ""
         return worst, ", ".join(dict.fromkeys(check.check for check in failed)), words
 
-    def flight(self, fault: GeometricFault) -> tuple[Result, Ints]:
+    def flight_with_fault(self, fault: GeometricFault) -> tuple[Result, Ints]:
         """The flight of the vehicles of a fault and of all that may come near them, and which (M,) these are."""
-        from rigidfleet.simulation.trajectories import of_curve
+        from rigidfleet.simulation.trajectories import result_of_curve
 
         who = fault.who
         again = np.isin(np.arange(self.n), who)
@@ -308,7 +308,7 @@ class Show:
         if air := data.get("disturbances"):
             data["disturbances"] = air | {"drag": [air["drag"][i] for i in every]}
         mission = Mission.from_plain(data, "drill")
-        return of_curve(Piecewise(knots, pieces), self.how, mission=mission), every
+        return result_of_curve(Piecewise(knots, pieces), self.how, mission=mission), every
 
     def way_by_fault(self, fault: GeometricFault) -> Piecewise:
         """The ways (K, S, 4, P) that vehicles (S,) fly by a fault, on knots of their own."""
@@ -316,7 +316,7 @@ class Show:
         pads, flown, turn, by = self.curve.pieces[0, :, :2, 0], self._ways_of(who), np.eye(2), 0.0
         match kind:
             case "late":
-                return flown.later(size)
+                return flown.shift_time(size)
             case "stale":
                 version = self.versions[int(size) - 1]
                 return Piecewise(version.time, version.pieces[:, who])
@@ -324,12 +324,12 @@ class Show:
                 source = (who + int(size)) % self.n
                 flown, by = self._ways_of(source), pads[who] - pads[source]
             case "bias" | "shifted":
-                by = size * _heading(stream.uniform(0.0, _TURN, len(who) if kind == "bias" else 1))
+                by = size * _bearings(stream.uniform(0.0, _TURN, len(who) if kind == "bias" else 1))
             case "rotated":
-                u, v = _heading(np.radians(size) * stream.choice([-1.0, 1.0]))[0]
+                u, v = _bearings(np.radians(size) * stream.choice([-1.0, 1.0]))[0]
                 turn = np.array([[v, u], [-u, v]])
             case "mirrored":
-                u = _heading(np.radians(size))
+                u = _bearings(np.radians(size))
                 turn = 2.0 * u.T @ u - turn
         if len(who) < self.n:  # a vehicle turns about its pad, the show about its origin
             by = by + pads[who] - pads[who] @ turn.T
@@ -370,7 +370,7 @@ class Show:
             within = np.clip(knots, own[0], own[-1])
             place = np.ascontiguousarray(self.curve.at(within)[:, :, :3].transpose(2, 0, 1))
             middle = 0.5 * (within[:-1] + within[1:])
-            sag = 2.0 * self._chords.sag[piece_at(own, middle)]
+            sag = 2.0 * self._chords.sag[piece_index(own, middle)]
             self._on_knots[key] = _Chords.through(place, sag)
         return self._on_knots[key]
 

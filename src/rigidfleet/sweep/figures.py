@@ -17,7 +17,7 @@ from rigidfleet.assessment import assess
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.plotting import encode_figure, write_files
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.areas import draw_from_above
+from rigidfleet.plotting.areas import draw_areas_from_above
 from rigidfleet.sweep.dataset import unit_and_meaning
 from rigidfleet.sweep.metrics import METRICS, readable_unit
 from rigidfleet.sweep.record import reason_in_words
@@ -25,8 +25,8 @@ from rigidfleet.sweep.run import flight_of_fault
 from rigidfleet.sweep.store import Table
 from rigidfleet.sweep.summary import (
     Borne,
-    drivers,
-    failures,
+    correlations_by_strength,
+    failure_counts,
     fault_rates,
     outcomes,
     varied_numbers,
@@ -110,7 +110,7 @@ def outcome(table: Table) -> Figure | None:
     """Success rate over the number of runs, with its confidence interval, and the failures of each check."""
     if not len(table.run):
         return None
-    reasons = failures(table)
+    reasons = failure_counts(table)
     fig = _titled_figure(table, "Outcome", st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6))
     left, right = fig.subplots(1, 2, width_ratios=(3, 2))
     n = np.unique(np.geomspace(1, len(table.run), 200).astype(int))
@@ -163,7 +163,7 @@ def shares(table: Table) -> Figure | None:
     for ax in axes[::_COLUMNS]:
         ax.set_ylabel("runs [%]")
     fig.supxlabel("magnitude, and to how many vehicles", fontsize=8)
-    _draw_key(fig, table)
+    _draw_run_legend(fig, table)
     return fig
 
 
@@ -180,11 +180,11 @@ def worst_runs(table: Table) -> Figure | None:
         table, "The worst of each fault from above [m]: ways into it", list(worst), 2.4
     )
     for case, ax in zip(worst.values(), axes, strict=True):
-        _draw_worst(ax, table, case)
+        _draw_worst_run(ax, table, case)
     return fig
 
 
-def _draw_worst(ax: Axes, table: Table, case: Borne) -> None:
+def _draw_worst_run(ax: Axes, table: Table, case: Borne) -> None:
     """Draw the worst run of a fault: vehicles when it fails, those concerned with their ways until then."""
     assert case.worst is not None
     result, every = flight_of_fault(table.sweep, case.worst.run)
@@ -194,7 +194,7 @@ def _draw_worst(ax: Axes, table: Table, case: Borne) -> None:
     since = int(np.searchsorted(result.time, end - _WAY))
     who = [int(x) - 1 for x in re.findall(r"\d+", failure.who.partition(",")[0])]
     xy = result.position[..., :2]
-    draw_from_above(ax, table.sweep.mission)
+    draw_areas_from_above(ax, table.sweep.mission)
     ax.plot(*xy[now].T, ".", color=PASSED, markersize=3)
     for i in who:
         ax.plot(*xy[since : now + 1, i].T, color=FAILED, linewidth=1.0)
@@ -222,7 +222,7 @@ def histograms(table: Table) -> Figure | None:
     for name, ax in zip(names, axes, strict=True):
         x = table.metrics[name]
         finite = np.isfinite(x)
-        scale = _scale(x[finite])
+        scale = _axis_scale(x[finite])
         low, high = float(x[finite].min()), float(x[finite].max())
         edges = (np.geomspace if scale == "log" else np.linspace)(low, high, _BINS + 1)
         below = np.zeros(_BINS)
@@ -243,14 +243,14 @@ def histograms(table: Table) -> Figure | None:
             shown = True
     for ax in axes[::_COLUMNS]:
         ax.set_ylabel("runs")
-    _draw_key(fig, table, limit=shown)
+    _draw_run_legend(fig, table, limit=shown)
     return fig
 
 
 def envelopes(table: Table) -> Figure | None:
     """Every metric over the number with the strongest correlation: runs, median and the middle 90 %."""
     strongest: dict[str, str] = {}
-    for d in drivers(table):
+    for d in correlations_by_strength(table):
         if d.outcome != "success":
             strongest.setdefault(d.outcome, d.varied)
     if not strongest:
@@ -265,21 +265,21 @@ def envelopes(table: Table) -> Figure | None:
         centres, low, middle, high = _running_percentiles(x[np.isfinite(y)], y[np.isfinite(y)])
         ax.fill_between(centres, low, high, color=st.INK, alpha=0.12, linewidth=0)
         ax.plot(centres, middle, color=st.INK)
-        scale = _scale(y[np.isfinite(y)])
+        scale = _axis_scale(y[np.isfinite(y)])
         ax.set_yscale(scale)
-        if _spacing(table, over) == "log":
+        if _scale_of_variation(table, over) == "log":
             ax.set_xscale("log")
             _log_ticks(ax.xaxis, x)
         ax.margins(x=0.02)
         ax.set_title(_metric_label(name), loc="left", fontsize=8.5)
         ax.set_xlabel(_axis_label(table, over).replace(", ", ",\n"), fontsize=7.5)
-    _draw_key(fig, table)
+    _draw_run_legend(fig, table)
     return fig
 
 
 def correlations(table: Table) -> Figure | None:
     """Rank correlation of every varied number with success and every metric."""
-    correlated = drivers(table)
+    correlated = correlations_by_strength(table)
     if not correlated:
         return None
     rows = list(dict.fromkeys(d.varied for d in correlated))[:_ROWS]
@@ -336,7 +336,7 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
     RigidfleetError
         The sweep has no such path or metric.
     """
-    numbers, correlated = varied_numbers(table), drivers(table)
+    numbers, correlated = varied_numbers(table), correlations_by_strength(table)
     if not metric:
         judged = outcomes(table)
         strongest = [d.outcome for d in correlated]
@@ -348,7 +348,7 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
             return None
     check_map(list(numbers), over, metric)
     values = 100.0 * table.passed if metric == "success" else table.metrics[metric]
-    (x, at_x), (y, at_y) = (_cells(numbers[p], _spacing(table, p)) for p in over)
+    (x, at_x), (y, at_y) = (_map_cells(numbers[p], _scale_of_variation(table, p)) for p in over)
     cells = np.full((len(y) - 1, len(x) - 1), np.nan)
     for i, j in np.ndindex(cells.shape):
         inside = values[(at_y == i) & (at_x == j)]
@@ -358,7 +358,7 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
     title = "Success rate" if metric == "success" else f"Median: {metric.replace('_', ' ')}"
     fig = _titled_figure(table, title, 0.75 * st.WIDTH, 0.58 * st.WIDTH)
     ax = fig.subplots()
-    wide = metric != "success" and _scale(cells[np.isfinite(cells)]) == "log"
+    wide = metric != "success" and _axis_scale(cells[np.isfinite(cells)]) == "log"
     look: dict[str, Any] = {"vmin": 0, "vmax": 100} if metric == "success" else {}
     look |= {"norm": "log"} if wide else {}
     image = ax.pcolormesh(x, y, cells, cmap="viridis", edgecolor="white", linewidth=0.4, **look)
@@ -373,7 +373,7 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
         if len(distinct) <= _VALUES:
             every = 1 + (len(distinct) > _LABELS)
             axis.set_ticks(range(0, len(distinct), every), [f"{v:.3g}" for v in distinct[::every]])
-        elif _spacing(table, name) == "log":
+        elif _scale_of_variation(table, name) == "log":
             scale("log")
             _log_ticks(axis, distinct)
     return fig
@@ -404,7 +404,7 @@ def _small_axes(
     return fig, axes[: len(names)]
 
 
-def _draw_key(fig: Figure, table: Table, *, limit: bool = False) -> None:
+def _draw_run_legend(fig: Figure, table: Table, *, limit: bool = False) -> None:
     from matplotlib.patches import Patch
 
     handles: list[Any] = [Patch(color=PASSED, label=f"{int(table.passed.sum())} passed")]
@@ -443,12 +443,12 @@ def _metric_limits(table: Table) -> dict[str, float]:
     }
 
 
-def _scale(x: Floats) -> str:
+def _axis_scale(x: Floats) -> str:
     wide = len(x) and x.min() > 0 and x.max() > _LOGARITHMIC * x.min()
     return "log" if wide else "linear"
 
 
-def _spacing(table: Table, name: str) -> str:
+def _scale_of_variation(table: Table, name: str) -> str:
     """Scale on which the varied number is evenly distributed."""
     column = next(c for c in table.sweep.columns if c.name == name)
     return "log" if isinstance(column.variation, LogUniform | Geomspace) else "linear"
@@ -463,7 +463,7 @@ def _log_ticks(axis: Axis, x: Floats) -> None:
     axis.set_ticks([], minor=True)
 
 
-def _cells(x: Floats, scale: str) -> tuple[Floats, Ints]:
+def _map_cells(x: Floats, scale: str) -> tuple[Floats, Ints]:
     """Edges of cells along an axis, and the cell of each run. Few distinct values have a cell each."""
     distinct = np.unique(x)
     if len(distinct) <= _VALUES:

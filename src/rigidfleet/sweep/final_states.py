@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet.assessment.fits import fits_of
+from rigidfleet.assessment.fits import formation_fits
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission
 from rigidfleet.mission.bounds import LENGTH, SPEED
@@ -21,7 +21,7 @@ from rigidfleet.mission.formations import coincident_pairs
 from rigidfleet.mission.kinds import seconds
 from rigidfleet.simulation.ensemble import Ensemble, establish, max_edge_error
 from rigidfleet.sweep.metrics import METRICS
-from rigidfleet.sweep.record import RunRecord, refusal
+from rigidfleet.sweep.record import RunRecord, refusal_reason
 from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def start_states(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats,
             _, name, *inner = column.keys
             place = states[str(name)][(slice(None), *map(int, inner))]
             by = drawn.reshape(-1, *(1,) * (place.ndim - 1))
-            place[:] = column.variation.apply(place, by)
+            place[:] = column.variation.apply_change(place, by)
     return states["position"], states["velocity"]
 
 
@@ -94,7 +94,7 @@ def _refusals(
         try:
             sweep.mission_of(runs[k])
         except MissionError as error:
-            refusals[int(k)] = refusal(error)
+            refusals[int(k)] = refusal_reason(error)
     return refusals
 
 
@@ -125,7 +125,7 @@ def _evaluate(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict
         slots = mission.formation_slots(formation)
         if slots is None or len(slots) < 2:
             continue
-        fits = [*fits_of(r, slots, np.arange(len(slots)), allowed)]
+        fits = [*formation_fits(r, slots, np.arange(len(slots)), allowed)]
         metrics["shape_end"] = error = np.array([fit.error for fit in fits])
         metrics["shape"] = np.fmax(metrics["shape"], error)
         misshapen = error > fits[0].limit

@@ -34,7 +34,7 @@ class Absent(dict[str, Any]):
     """Defaults of a table that a mission does not have."""
 
 
-def name_of(keys: Keys) -> str:
+def path_of_keys(keys: Keys) -> str:
     """Keys as a path: (`agents`, `mass`, 1) becomes `agents.mass.2`."""
     return ".".join(str(k + 1) if isinstance(k, int) else toml_key(k) for k in keys)
 
@@ -54,7 +54,7 @@ def expand_path(whole: Mapping[str, Any], path: str) -> list[Keys]:
     places, depth = _matches(whole, steps)
     if depth < len(steps):
         problem = f"there is no '{steps[depth]}' in {'.'.join(steps[:depth]) or 'the mission'}"
-        raise NotationError(problem, _remedy(whole, places[0][1], steps, depth))
+        raise NotationError(problem, _path_remedy(whole, places[0][1], steps, depth))
     return [keys for keys, _ in places]
 
 
@@ -86,9 +86,9 @@ def is_absent(whole: Mapping[str, Any], keys: Keys) -> bool:
     return any(isinstance(look_up(whole, keys[:k]), Absent) for k in range(1, len(keys)))
 
 
-def flatten(value: Any) -> list[Any]:
+def flatten_lists(value: Any) -> list[Any]:
     """Entries of nested lists, in order."""
-    return [x for v in value for x in flatten(v)] if isinstance(value, list) else [value]
+    return [x for v in value for x in flatten_lists(v)] if isinstance(value, list) else [value]
 
 
 def map_nested(value: Any, function: Callable[[Any], Any]) -> Any:
@@ -159,9 +159,9 @@ def _children(at: Any, step: str) -> Iterator[tuple[str | int, Any]]:
         yield from [*enumerate(at)][int(step) - 1 : int(step)] if int(step) else []
 
 
-def _remedy(whole: Mapping[str, Any], at: Any, steps: list[str], depth: int) -> str:
+def _path_remedy(whole: Mapping[str, Any], at: Any, steps: list[str], depth: int) -> str:
     """Suggest a similar path that exists, or list what exists at this depth."""
-    for guess in _guesses(whole, at, steps, depth):
+    for guess in _guess_paths(whole, at, steps, depth):
         places, reached = _matches(whole, guess)
         if reached == len(guess) and not any(isinstance(x, dict) for _, x in places):
             words = (word if word == ANY else toml_key(word) for word in guess)
@@ -175,7 +175,7 @@ def _remedy(whole: Mapping[str, Any], at: Any, steps: list[str], depth: int) -> 
     return "the path ends there; remove the rest"
 
 
-def _guesses(
+def _guess_paths(
     whole: Mapping[str, Any], at: Any, steps: list[str], depth: int
 ) -> Iterator[list[str]]:
     """Paths that may be meant, the likeliest first."""

@@ -75,17 +75,17 @@ def readable_unit(unit: str) -> str:
     return display_unit(words.get(unit, unit))
 
 
-def measure(result: Result, verdict: Verdict) -> dict[str, float]:
+def measure_metrics(result: Result, verdict: Verdict) -> dict[str, float]:
     """Value of every metric of a flight; NaN if it does not apply."""
     phases = verdict.phases
     shapes = [p.shape for p in phases if p.shape is not None]
     hands = [float(p.handedness) for p in phases if p.handedness is not None]
     values = {
         "shape_end": shapes[-1] if shapes else math.nan,
-        "shape": _greatest(shapes),
-        "constraint_end": _greatest(p.constraint for p in phases[-1:]),
+        "shape": _greatest_known(shapes),
+        "constraint_end": _greatest_known(p.constraint for p in phases[-1:]),
         "handed": min(hands, default=math.nan),
-        "flip": _greatest(p.flip for p in phases),
+        "flip": _greatest_known(p.flip for p in phases),
         "flown": float(result.time[-1]),
         "steps": float(result.statistics["steps"]),
         "evaluations": float(result.statistics["evaluations"]),
@@ -93,7 +93,7 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
     values |= _flight_errors(result)
     for name in ("position", "velocity", "attitude", "rates"):
         misses = (getattr(w, name) for p in phases for w in (p.waypoint, p.stay) if w)
-        values[f"waypoint_{name}"] = _greatest(misses)
+        values[f"waypoint_{name}"] = _greatest_known(misses)
     checks = verdict.by_name
     worst = {name: f.worst for name, f in checks.items() if f.worst is not None}
     if (rotor := checks.get("rotor_force")) is not None:
@@ -105,7 +105,7 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
     return {name: float((worst | values).get(name, math.nan)) for name in METRICS}
 
 
-def _greatest(values: Iterable[float | None]) -> float:
+def _greatest_known(values: Iterable[float | None]) -> float:
     return max((v for v in values if v is not None), default=math.nan)
 
 

@@ -36,10 +36,10 @@ class RunRecord:
     codes: tuple[float, ...]
     metrics: dict[str, float]
     wall: float
-    level: str = field(default_factory=levels.target_level)
+    level: str = field(default_factory=levels.target_instruction_level)
 
 
-def refusal(error: MissionError) -> tuple[str, str]:
+def refusal_reason(error: MissionError) -> tuple[str, str]:
     """Reason and detail of a run whose mission has errors."""
     first = error.findings[0]
     words = f"{first.key} = {first.value!r}: {first.problem}"

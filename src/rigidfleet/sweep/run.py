@@ -13,8 +13,8 @@ from rigidfleet.errors import FlightError, MissionError
 from rigidfleet.mission import Mission
 from rigidfleet.sweep import faults
 from rigidfleet.sweep.definition import Sweep
-from rigidfleet.sweep.metrics import METRICS, measure
-from rigidfleet.sweep.record import BROKEN, RAISED, RunRecord, refusal
+from rigidfleet.sweep.metrics import METRICS, measure_metrics
+from rigidfleet.sweep.record import BROKEN, RAISED, RunRecord, refusal_reason
 from rigidfleet.typing import Ints
 
 if TYPE_CHECKING:
@@ -41,14 +41,14 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
             rows.append(_record_fault(sweep, run))
         else:
             groups.setdefault(run // GROUP, []).append(run)
-    return rows + [row for group in groups.values() for row in _fly(sweep, group)]
+    return rows + [row for group in groups.values() for row in _fly_group(sweep, group)]
 
 
 def _record_fault(sweep: Sweep, run: int) -> RunRecord:
     """Judge a geometric fault of a drill."""
     show, fault = _show_and_fault(sweep, run)
     begun = perf_counter()
-    outcome = _value_or_error(lambda: show.outcome(fault))
+    outcome = _value_or_error(lambda: show.measure_fault(fault))
     return _record(sweep, run, sweep.values(run), outcome, begun)
 
 
@@ -67,17 +67,17 @@ def flight_of_fault(sweep: Sweep, run: int) -> tuple[Result, Ints]:
     if sweep.values(run)[0] in faults.FLOWN:
         return simulate(sweep.mission_of(run)), np.arange(sweep.mission.n_agents)
     show, fault = _show_and_fault(sweep, run)
-    return show.flight(fault)
+    return show.flight_with_fault(fault)
 
 
-def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
+def _fly_group(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     """Fly a group of runs side by side; one by one, if anything unforeseen happens to any of them."""
     from rigidfleet.simulation.flight import simulate
     from rigidfleet.simulation.together import MOST_VEHICLES, simulate_together
 
     law, header = sweep.law[0], sweep.header
 
-    def flight_of(mission: Mission) -> Result:
+    def fly_mission(mission: Mission) -> Result:
         if header.agent:
             return simulate(mission, agent=law)
         own = law() if isinstance(law, type) else law
@@ -99,7 +99,7 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
         # Each flight is let go of when it is judged: the next one's record takes its memory over.
         begun, flight = perf_counter() - shared, flown.pop(run)
         if isinstance(flight, Mission):
-            flight = _value_or_error(lambda mission=flight: flight_of(mission))
+            flight = _value_or_error(lambda mission=flight: fly_mission(mission))
         rows.append(_record(sweep, run, values[run], flight, begun))
         del flight
     return rows
@@ -120,11 +120,11 @@ def _record(sweep: Sweep, run: int, values: Sequence[Any], flown: Any, begun: fl
     codes = tuple(c.variation.encode(v) for c, v in zip(sweep.columns, values, strict=True))
     metrics = dict.fromkeys(METRICS, math.nan)
     done = isinstance(flown, Exception | tuple)
-    outcome = flown if done else _value_or_error(lambda: _judge(flown))
+    outcome = flown if done else _value_or_error(lambda: _metrics_and_failure(flown))
     match outcome:
         case MissionError():
-            reason, detail = refusal(outcome)
-        case FlightError() if sweep.header.own[1]:
+            reason, detail = refusal_reason(outcome)
+        case FlightError() if sweep.header.own_law[1]:
             reason, detail = RAISED, str(outcome)
         case Exception():
             reason, detail = BROKEN, f"{type(outcome).__name__}: {outcome}"
@@ -135,11 +135,11 @@ def _record(sweep: Sweep, run: int, values: Sequence[Any], flown: Any, begun: fl
     return RunRecord(run, not reason, reason, " ".join(detail.split()), codes, metrics, wall)
 
 
-def _judge(result: Result) -> tuple[dict[str, float], str, str]:
+def _metrics_and_failure(result: Result) -> tuple[dict[str, float], str, str]:
     """Metrics of a flight, and why it has failed."""
     from rigidfleet.assessment import assess
 
     verdict = assess(result)
     failed = [f for f in verdict.checks if not f.passed]
     reason = ", ".join(dict.fromkeys(f.check for f in failed))
-    return measure(result, verdict), reason, failed[0].message if failed else ""
+    return measure_metrics(result, verdict), reason, failed[0].message if failed else ""

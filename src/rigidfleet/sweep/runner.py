@@ -20,7 +20,7 @@ from rigidfleet.sweep import workers as pools
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.record import RunRecord
 from rigidfleet.sweep.run import GROUP, fly_runs
-from rigidfleet.sweep.shards import own_runs, shard_folder
+from rigidfleet.sweep.shards import runs_of_shard, shard_folder
 from rigidfleet.sweep.store import Store, Table, read
 from rigidfleet.typing import Bools
 
@@ -103,12 +103,12 @@ def fly(
     """
     if not isinstance(pool, Executor | None):
         raise wrong_type("an Executor of concurrent.futures as pool", pool)
-    own, folder = own_runs(shard, sweep.runs), shard_folder(Path(folder), shard)
+    own, folder = runs_of_shard(shard, sweep.runs), shard_folder(Path(folder), shard)
     count = cores() if workers is None else workers
     with Store(folder, sweep, shard, replace) as store:
         flight = _Sweeping(sweep, store, progress, own)
         if cluster is not None:
-            with pools.cluster(cluster) as (executor, capacity):
+            with pools.open_cluster(cluster) as (executor, capacity):
                 flight.hand_out(executor, capacity)
         elif pool is not None:
             flight.hand_out(pool, lambda: count)
@@ -117,9 +117,9 @@ def fly(
             deaths = 0
             while flight.missing:
                 before = flight.flown
-                flight.report(count)
+                flight.report_progress(count)
                 try:
-                    with pools.processes(count) as executor:
+                    with pools.start_processes(count) as executor:
                         flight.hand_out(executor, lambda: count)
                 except RigidfleetError as error:
                     if not isinstance(error.__cause__, BrokenExecutor):
@@ -147,7 +147,7 @@ class _Sweeping:
         self.begun = self.changed = perf_counter()
         self.pace = 0.0  # [s] a run
         _log.info(f"{self.words()}; begun")
-        self.report(1)
+        self.report_progress(1)
 
     def fly_alone(self, *, until_worth: bool) -> None:
         """Fly in this process: all runs, or until the remaining work justifies more processes."""
@@ -155,7 +155,7 @@ class _Sweeping:
             if until_worth and self.pace * GROUP * len(self.missing) > WORTH:
                 return
             self.store_records(fly_runs(self.sweep, self.take_chunk(1)))
-            self.report(1)
+            self.report_progress(1)
 
     def hand_out(self, executor: Executor, capacity: Callable[[], int]) -> None:
         """Fly all missing runs by an executor with a number of workers. Runs that do not come back are missing again.
@@ -166,7 +166,7 @@ class _Sweeping:
             The executor failed, by the error that is the cause.
         """
 
-        def outcome(call: Callable[..., Any], *arguments: Any) -> Any:
+        def call_or_fail(call: Callable[..., Any], *arguments: Any) -> Any:
             try:
                 return call(*arguments)
             except RigidfleetError:
@@ -179,15 +179,15 @@ class _Sweeping:
         sweep = self.sweep.json(), self.sweep.version
         try:
             while self.missing or flying:
-                workers = outcome(capacity)
+                workers = call_or_fail(capacity)
                 while self.missing and len(flying) < _AHEAD * max(1, workers):
                     taken = self.take_chunk(max(1, workers))
-                    flying[outcome(executor.submit, pools.fly_chunk, *sweep, taken)] = taken
+                    flying[call_or_fail(executor.submit, pools.fly_chunk, *sweep, taken)] = taken
                     taken = []
                 for future in wait(flying, _LOOK, FIRST_COMPLETED).done:
-                    self.store_records(outcome(future.result))
+                    self.store_records(call_or_fail(future.result))
                     del flying[future]
-                self.report(workers)
+                self.report_progress(workers)
         finally:
             for future, runs in flying.items():
                 future.cancel()
@@ -205,7 +205,7 @@ class _Sweeping:
 
     def store_records(self, rows: list[RunRecord]) -> None:
         """Store the records of a chunk."""
-        self.store.add(rows)
+        self.store.add_records(rows)
         self.finished_runs[[row.run for row in rows]] = True
         self.flown += len(rows)
         self.failed += sum(not row.passed for row in rows)
@@ -220,7 +220,7 @@ class _Sweeping:
         """Runs that are saved, and where."""
         return f"{self.store.path.parent}: {self.finished_runs.sum()} of {self.runs} runs"
 
-    def report(self, workers: int) -> None:
+    def report_progress(self, workers: int) -> None:
         """Tell the progress."""
         if workers != self.workers:
             level = logging.WARNING if workers < self.workers else logging.INFO

@@ -18,7 +18,7 @@ _SHARDS = "shards"
 _MOVE = "Move the wrong one out of the folder."
 
 
-def own_runs(shard: str, runs: int) -> Bools:
+def runs_of_shard(shard: str, runs: int) -> Bools:
     """Mask (runs,) of the runs of a shard, "3/40": every 40th group, so that shards grow with their sweep; "": all.
 
     Raises
@@ -80,7 +80,7 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
             f" `rigidfleet sweep {folder} --shard {lacking[0]}/{count}`, and merge again."
         )
     with Store(folder, sweep, "", replace) as store:
-        store.insert(row for _, row in rows.values())
+        store.insert_rows(row for _, row in rows.values())
     return read(folder)
 
 

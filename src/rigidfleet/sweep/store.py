@@ -96,7 +96,7 @@ class Store:
                     self.path.with_name(FILE + end).unlink(missing_ok=True)
             self.db = sqlite3.connect(self.path, isolation_level=None)
             opened.enter_context(closing(self.db))
-            self._open(sweep)
+            self._open_database(sweep)
             self._close = opened.pop_all().close
 
     def __enter__(self) -> Self:
@@ -105,9 +105,9 @@ class Store:
     def __exit__(self, *_: object) -> None:
         self._close()
 
-    def add(self, rows: Iterable[RunRecord]) -> None:
+    def add_records(self, rows: Iterable[RunRecord]) -> None:
         """Store records, all of them or none. A record replaces an earlier one of the same run."""
-        self.insert(
+        self.insert_rows(
             (
                 row.run, int(row.passed), row.reason, row.detail, row.wall, row.level,
                 np.array(row.codes, dtype=_CODES).tobytes(),
@@ -116,7 +116,7 @@ class Store:
             for row in rows
         )  # fmt: skip
 
-    def insert(self, rows: Iterable[tuple[Any, ...]]) -> None:
+    def insert_rows(self, rows: Iterable[tuple[Any, ...]]) -> None:
         """Store rows as `store_contents` returns them, all of them or none."""
         names, marks = ", ".join(f'"{name}"' for name in _COLUMNS), ", ".join("?" * len(_COLUMNS))
         with _as_result_errors(self.path), self.db:
@@ -131,7 +131,7 @@ class Store:
             mask[[n for (n,) in numbers]] = True
         return mask
 
-    def _open(self, sweep: Sweep) -> None:
+    def _open_database(self, sweep: Sweep) -> None:
         self.runs = sweep.runs
         # A log needs memory that processes share, which a network's disk has not; shards often lie on one.
         self.db.execute(f"PRAGMA journal_mode = {'DELETE' if self.shard else 'WAL'}")

@@ -152,9 +152,13 @@ class Summary(Shown):
         """Percentiles, reasons of failure, rank correlations, and the rate of success."""
         s, n = self.success, len(self.drivers)
         strong = [d for d in self.drivers if d.adjusted < _CHANCE]
-        parts: list[Any] = [self._percentiles(), self._reasons(), self._correlations(strong)]
+        parts: list[Any] = [
+            self._percentile_table(),
+            self._reason_table(),
+            self._correlation_table(strong),
+        ]
         if self.drill:
-            parts = [*self._cases(), self._reasons()]
+            parts = [*self._case_tables(), self._reason_table()]
         if n:
             words = f"{len(strong)} of {n} pairs tested correlate (false discovery rate {100 * _CHANCE:g} %)."
             parts.append(Line(words))
@@ -193,7 +197,7 @@ class Summary(Shown):
             lines.append(f"{fault.capitalize()}: {words}{why}.")
         return lines
 
-    def _cases(self) -> list[FactTable]:
+    def _case_tables(self) -> list[FactTable]:
         """Shares of each case, and below them the worst run of those that fail: its words are too long for a column."""
         shares, worst = [], []
         for x in self.drill:
@@ -209,12 +213,12 @@ class Summary(Shown):
             FactTable((*heads, "run", "the worst"), worst, ("the worst",)),
         ]
 
-    def _percentiles(self) -> FactTable:
+    def _percentile_table(self) -> FactTable:
         heads = "metric", "unit", "min", "5 %", "25 %", "median", "75 %", "95 %", "max"
         units = {name: readable_unit(METRICS[name].unit) for name in self.percentiles}
         return FactTable(heads, [Row((x, units[x], *v)) for x, v in self.percentiles.items()])
 
-    def _reasons(self) -> FactTable:
+    def _reason_table(self) -> FactTable:
         rows = []
         for reason, count in self.reasons.items():
             example = self.examples[reason]
@@ -223,7 +227,7 @@ class Summary(Shown):
             rows.append(Row((reason_in_words(reason), count, share, words)))
         return FactTable(("failed check", "runs", "of all", "for example"), rows, ("for example",))
 
-    def _correlations(self, strong: Sequence[Driver]) -> FactTable:
+    def _correlation_table(self, strong: Sequence[Driver]) -> FactTable:
         """The strongest, those with success first."""
         first = sorted(strong, key=lambda d: d.outcome != "success")[:_SHOWN]
         rows = [Row((d.varied, d.outcome, f"{d.correlation:+.2f}")) for d in first]
@@ -241,7 +245,8 @@ def summarise(table: store.Table) -> Summary:
         if column.in_words:
             words = np.array([str(column.variation.decode(x)) for x in table.codes[:, k].tolist()])
             by_value[column.name] = {
-                word: rate(table.passed[words == word]) for word in dict.fromkeys(words.tolist())
+                word: pass_rate(table.passed[words == word])
+                for word in dict.fromkeys(words.tolist())
             }
     sweep = table.sweep
     seeded = any(column.keys[-1] == "seed" for column in sweep.columns)
@@ -251,11 +256,11 @@ def summarise(table: store.Table) -> Summary:
         sweep.mission.name,
         sweep.runs,
         len(table.run),
-        rate(table.passed),
-        failures(table),
-        _examples(table),
+        pass_rate(table.passed),
+        failure_counts(table),
+        _examples_by_reason(table),
         percentiles,
-        drivers(table),
+        correlations_by_strength(table),
         by_value,
         numbers if sweep.random else "none",
         table.levels,
@@ -277,17 +282,17 @@ def fault_rates(table: store.Table) -> list[Borne]:
             k = failed[np.where(np.isnan(apart[~passed]), np.inf, apart[~passed]).argmin()]
             worst = Example(int(table.run[k]), str(table.detail[k]))
         least = float(np.fmin.reduce(apart)) if np.isfinite(apart).any() else None
-        cases.append(Borne(fault, size, UNITS[fault], int(count), rate(~passed), least, worst))
+        cases.append(Borne(fault, size, UNITS[fault], int(count), pass_rate(~passed), least, worst))
     return cases
 
 
-def failures(table: store.Table) -> dict[str, int]:
+def failure_counts(table: store.Table) -> dict[str, int]:
     """Number of runs that failed each check, most frequent first."""
     failed = [reason for reasons in table.reason for reason in reasons.split(", ") if reason]
     return dict(Counter(failed).most_common())
 
 
-def _examples(table: store.Table) -> dict[str, Example]:
+def _examples_by_reason(table: store.Table) -> dict[str, Example]:
     """An example of each reason, preferably a run that fails it first: messages are about the first check."""
     with_detail: dict[str, Example] = {}
     others: dict[str, Example] = {}
@@ -300,7 +305,7 @@ def _examples(table: store.Table) -> dict[str, Example]:
     return others | with_detail
 
 
-def rate(passed: Bools) -> Rate:
+def pass_rate(passed: Bools) -> Rate:
     """Success rate with its Wilson interval; NaN with the interval 0 to 1 if there are no runs."""
     n, k = len(passed), int(passed.sum())
     if n == 0:
@@ -336,22 +341,22 @@ def varied_numbers(table: store.Table) -> dict[str, Floats]:
     }
 
 
-def drivers(table: store.Table) -> list[Driver]:
+def correlations_by_strength(table: store.Table) -> list[Driver]:
     """Rank correlation of every varied number with every outcome, strongest first; of a drill's faults, none."""
     if table.sweep.drill is not None:
         return []
     tested: list[tuple[str, str, float, float]] = []
     numbers = varied_numbers(table)
-    ranked = {name: _ranks(x) for name, x in numbers.items()}
+    ranked = {name: _centred_ranks(x) for name, x in numbers.items()}
     for outcome, y in outcomes(table).items():
         there = np.isfinite(y)
         if (n := int(there.sum())) < 4:
             continue
         every = n == len(y)
-        y_ranked = _ranks(y[there])
+        y_ranked = _centred_ranks(y[there])
         for name, x in numbers.items():
             if every or _differs(x[there]):
-                x_ranked = ranked[name] if every else _ranks(x[there])
+                x_ranked = ranked[name] if every else _centred_ranks(x[there])
                 tested.append((name, outcome, *_rank_correlation(x_ranked, y_ranked)))
     adjusted = _adjusted_p_values(np.array([chance for *_, chance in tested]))
     pairs = [Driver(*d, float(q)) for d, q in zip(tested, adjusted, strict=True)]
@@ -367,7 +372,7 @@ def _adjusted_p_values(chance: Floats) -> Floats:
     return adjusted
 
 
-def _ranks(x: Floats) -> Floats:
+def _centred_ranks(x: Floats) -> Floats:
     """Ranks (n,) of values, centred; equal values have their mean rank."""
     _, which, counts = np.unique(x, return_inverse=True, return_counts=True)
     return (np.cumsum(counts) - 0.5 * counts)[which] - 0.5 * len(x)

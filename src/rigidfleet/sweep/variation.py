@@ -54,7 +54,7 @@ class Variation(Part):
         """Values that are taken in turn; none of a distribution."""
         return ()
 
-    def apply(self, there: Any, value: Any) -> Any:
+    def apply_change(self, there: Any, value: Any) -> Any:
         """What is in the place of a number, or of an array, for a value of the variation."""
         return _CHANGES[self.change](there, value)
 
@@ -141,24 +141,24 @@ class _Listed(Variation):
 
     def encode(self, value: Any) -> float:
         """Encode a value: itself if all values are numbers, else its index."""
-        return float(value) if self._numeric else float(self.values.index(value))
+        return float(value) if self._is_numeric else float(self.values.index(value))
 
     def decode(self, code: float) -> Any:
         """Decode a value."""
-        return code if self._numeric else self.values[int(code)]
+        return code if self._is_numeric else self.values[int(code)]
 
     def find_error(self) -> tuple[str, str, str] | None:
         """Error if a value is of another type, or if values that are not numbers are to be added or scaled."""
-        if not all(map(_usable, self.values)):
+        if not all(map(_is_usable_value, self.values)):
             words = "finite numbers, words, true or false, or lists of these"
             return "values", f"must be {words}", "correct the value"
-        if self.change != "set" and not self._numeric:
+        if self.change != "set" and not self._is_numeric:
             problem = f"must be numbers to {self.change}"
             return "values", problem, "give numbers or use change = 'set'"
         return None
 
     @cached_property
-    def _numeric(self) -> bool:
+    def _is_numeric(self) -> bool:
         return all(map(is_number, self.values))
 
 
@@ -228,7 +228,7 @@ _LINE = re.compile(r"\s*(.+?)\s*(\+=|\*=|=)\s*([\w-]+)\s*\((.*)\)\s*", re.DOTALL
 _FORM = "write PATH = KIND(NUMBERS), as in agents.mass.* *= normal(1, 0.05)"
 
 
-def parse_line(line: str) -> dict[str, Any]:
+def parse_variation(line: str) -> dict[str, Any]:
     """Parse a line into the table that it stands for.
 
     Raises
@@ -259,10 +259,10 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _usable(value: object) -> bool:
+def _is_usable_value(value: object) -> bool:
     """Whether a mission may have a value."""
     if isinstance(value, list | tuple | dict):
-        return all(map(_usable, value.values() if isinstance(value, dict) else value))
+        return all(map(_is_usable_value, value.values() if isinstance(value, dict) else value))
     return isinstance(value, str) or (isinstance(value, int | float) and abs(value) <= _MOST)
 
 

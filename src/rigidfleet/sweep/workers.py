@@ -45,7 +45,7 @@ def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
 
 
 @contextmanager
-def processes(count: int) -> Generator[Executor]:
+def start_processes(count: int) -> Generator[Executor]:
     """Start persistent processes on this machine. They end with this process, even if it is killed.
 
     They are forks of this process where that is safe, as they then begin with all that it has loaded. Elsewhere, each
@@ -94,9 +94,9 @@ def _begin_worker(inheritance: Inheritance | None) -> None:
     gc.freeze()
     gc.set_threshold(100_000)
     if inheritance is not None:
-        from rigidfleet.kernel.engine.native import inherit
+        from rigidfleet.kernel.engine.native import inherit_code
 
-        inherit(inheritance)
+        inherit_code(inheritance)
 
 
 def _end_with_parent() -> None:
@@ -107,7 +107,7 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def cluster(address: str) -> Generator[tuple[Executor, Callable[[], int]]]:
+def open_cluster(address: str) -> Generator[tuple[Executor, Callable[[], int]]]:
     """Use the workers of a Dask cluster: an executor, and a function that returns how many there are at the moment.
 
     Raises

@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.toml import text_has_data, to_toml
+from rigidfleet._common.toml import to_toml, toml_equals_data
 from rigidfleet.math import lqr, pid
-from rigidfleet.math.margins import Loop, LoopGains, Margins, margins
+from rigidfleet.math.margins import Loop, LoopGains, Margins, stability_margins
 from rigidfleet.mission import Mission
 from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.schema import Tracking
-from rigidfleet.planning.preview import preview
+from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.planning.vehicles import vehicle_lags
-from rigidfleet.preflight.margins import ClosedLoops, formation_laws, tracking_law
+from rigidfleet.preflight.margins import ClosedLoops, formation_closed_loops, tracking_closed_loops
 from rigidfleet.typing import Floats
 
 #: A gain by its path in the mission, as in a variation.
@@ -67,7 +67,7 @@ class GainSpace:
         self.own = own
         self.ends = {path: tuple(gain * f for f in RANGES[path]) for path, gain in own.items()}
 
-    def gains(self, x: Sequence[float] | Floats) -> Gains:
+    def gains_at(self, x: Sequence[float] | Floats) -> Gains:
         """The gains at a point x (D,), to four digits; there, the mission's own are whole."""
         gains = {}
         for u, (path, (low, high)) in zip(x, self.ends.items(), strict=True):
@@ -76,7 +76,7 @@ class GainSpace:
         return gains
 
     @property
-    def start(self) -> Floats:
+    def own_point(self) -> Floats:
         """The point (D,) of the mission's own gains."""
         return np.array(
             [math.log(self.own[p] / a) / math.log(b / a) for p, (a, b) in self.ends.items()]
@@ -112,21 +112,21 @@ class Screen:
         lags = vehicle_lags(mission)
         laws: list[tuple[str, ClosedLoops]] = []
         if lags:
-            tracking = tracking_law(mission, lags)
+            tracking = tracking_closed_loops(mission, lags)
             laws += [] if tracking is None else [(TRACKING, tracking)]
-            looped, _ = formation_laws(mission, preview(mission)[0], lags)
+            looped, _ = formation_closed_loops(mission, preview_phases(mission)[0], lags)
             laws += [(CONSTRAINT, law) for law in looped]
         self.parts = _distinct_parts(laws)
-        self.own = self.margins(self.gains)
+        self.own = self.margins_by_law(self.gains)
 
-    def margins(self, gains: Gains) -> dict[str, Margins]:
+    def margins_by_law(self, gains: Gains) -> dict[str, Margins]:
         """The smallest margins of each law with some gains."""
         smallest: dict[str, Margins] = {}
         for name, m in self._margins_of_parts(gains):
             smallest[name] = smallest[name].smaller_margins(m) if name in smallest else m
         return smallest
 
-    def slack(self, gains: Gains) -> float:
+    def margin_slack(self, gains: Gains) -> float:
         """By how much the margins exceed what is asked, as a share of the mission's own; negative if they are worse."""
         c = {key: gains.get(f"constraint.{key}", 0.0) for key in ("alpha", "beta", "gamma")}
         if "constraint.alpha" in self.gains and not pid.is_stable(**c):
@@ -151,7 +151,7 @@ class Screen:
                 key: combined.get(f"constraint.{key}", 0.0) for key in ("alpha", "beta", "gamma")
             }
         for part in self.parts:
-            yield part.name, margins([part.loop], replace(part.law, **new), part.growth)
+            yield part.name, stability_margins([part.loop], replace(part.law, **new), part.growth)
 
 
 def _distinct_parts(laws: Sequence[tuple[str, ClosedLoops]]) -> list[_Part]:
@@ -183,14 +183,14 @@ def feasible_points(
 
     Where margins refuse `_TRIES` points in a row, the next one is drawn towards the mission's own gains.
     """
-    start = space.start
+    start = space.own_point
     points = [start]
     while len(points) < count:
         for _ in range(_TRIES):
             x = rng.random(len(start))
-            if slack(space.gains(x)) >= 0:
+            if slack(space.gains_at(x)) >= 0:
                 break
-        while slack(space.gains(x)) < 0 and np.abs(x - start).max() > 1e-3:
+        while slack(space.gains_at(x)) < 0 and np.abs(x - start).max() > 1e-3:
             x = start + 0.7 * (x - start)
         points.append(x)
     return np.array(points)
@@ -204,13 +204,13 @@ def with_gains(text: str, gains: Gains) -> str:
     document = tomllib.loads(text)
     wanted = copy.deepcopy(document)
     new = text
-    for table, key, value in _entries(document, gains):
+    for table, key, value in _gain_entries(document, gains):
         wanted.setdefault(table, {})[key] = value
         new = _replace_line(new, table, key, to_toml({key: value}).strip())
-    return new if text_has_data(new, wanted) else digest_lines(text) + to_toml(wanted)
+    return new if toml_equals_data(new, wanted) else digest_lines(text) + to_toml(wanted)
 
 
-def _entries(document: dict[str, Any], gains: Gains) -> Iterator[tuple[str, str, Any]]:
+def _gain_entries(document: dict[str, Any], gains: Gains) -> Iterator[tuple[str, str, Any]]:
     """Table, key and value of each entry; both weights of Q are one."""
     Q = list(document.get("tracking", {}).get("Q", Tracking.model_fields["Q"].get_default()))
     for path, gain in gains.items():

@@ -156,16 +156,16 @@ class Tuned(Shown):
             (path, f"{gain:.4g}", f"{self.after.gains[path]:.4g}", "")
             for path, gain in self.before.gains.items()
         ]
-        rows += self._of_flights("tuning", self.before, self.after, [self.metric])
+        rows += self._flight_rows("tuning", self.before, self.after, [self.metric])
         if self.validation is not None:
-            rows += self._of_flights("new", *self.validation, list(_WORDS))
+            rows += self._flight_rows("new", *self.validation, list(_WORDS))
         for law, was in self.margins[0].items():
             now = self.margins[1][law]
             for what, read in _MARGINS.items():
                 rows.append((f"{law}: {what}", read(was), read(now), ""))
         return rows
 
-    def _of_flights(
+    def _flight_rows(
         self, which: str, before: Flown, after: Flown, metrics: list[str]
     ) -> list[tuple[str, str, str, str]]:
         """Rows of the flights on some seeds."""

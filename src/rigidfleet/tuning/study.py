@@ -33,7 +33,7 @@ from rigidfleet.mission.loading import as_mission
 from rigidfleet.sweep import Sweep, SweepProgress, Table, fly
 from rigidfleet.sweep.record import BROKEN, REFUSED
 from rigidfleet.sweep.runner import WORTH
-from rigidfleet.sweep.workers import processes
+from rigidfleet.sweep.workers import start_processes
 from rigidfleet.tuning.gains import Gains, GainSpace, Screen, feasible_points, own_gains, with_gains
 from rigidfleet.tuning.outcome import Flown, Tuned
 from rigidfleet.typing import Floats
@@ -109,7 +109,7 @@ def tune(
         On Ctrl-C. What was flown is kept, and the same call goes on.
     """
     own_mission = as_mission(mission)
-    flown = own_mission.rewritten(_merge(own_mission.to_dict(), assume or {}))
+    flown = own_mission.rewritten(_merge_keys(own_mission.to_dict(), assume or {}))
     paths = _seed_paths(flown)
     seeds, validation = (seeds, validation) if paths else (1, 0)
     if objective == "shape" and True not in _tracking_of_phases(flown):
@@ -118,7 +118,7 @@ def tune(
         "objective": objective, "seeds": seeds, "validation": validation, "seed": seed,
         "margin_share": margin_share,
     }  # fmt: skip
-    if problem := next(_problems(flown, budget, options), ""):
+    if problem := next(_option_problems(flown, budget, options), ""):
         raise RigidfleetError(problem)
     folder = as_path(folder)
     claim = _Claim(
@@ -141,7 +141,7 @@ def _tracking_of_phases(mission: Mission) -> set[bool]:
     return {phase.control == "tracking" for phase in mission.phases}
 
 
-def _problems(mission: Mission, budget: int, options: Mapping[str, Any]) -> Iterator[str]:
+def _option_problems(mission: Mission, budget: int, options: Mapping[str, Any]) -> Iterator[str]:
     """What is wrong with options, or with a mission in which there is nothing to tune."""
     name, objective = mission.name, options["objective"]
     if objective not in OBJECTIVES:
@@ -166,13 +166,13 @@ def _problems(mission: Mission, budget: int, options: Mapping[str, Any]) -> Iter
         yield f"{name}: {why}. Add [vehicles] or [disturbances], or assume them for the study."
 
 
-def _merge(document: dict[str, Any], assume: Mapping[str, Any]) -> dict[str, Any]:
+def _merge_keys(document: dict[str, Any], assume: Mapping[str, Any]) -> dict[str, Any]:
     """A document with some of its keys replaced; tables are merged."""
     merged = dict(document)
     for key, value in assume.items():
         there = merged.get(key)
         both = isinstance(there, dict) and isinstance(value, Mapping)
-        merged[key] = _merge(there, value) if both else value
+        merged[key] = _merge_keys(there, value) if both else value
     return merged
 
 
@@ -189,7 +189,7 @@ def _seed_paths(mission: Mission) -> list[str]:
     return [f"{name}.seed" for name, acts in acting.items() if acts]
 
 
-def _measurements(table: Table, candidates: Sequence[Gains], seeds: int) -> list[Flown]:
+def _flown_of_candidates(table: Table, candidates: Sequence[Gains], seeds: int) -> list[Flown]:
     """What was measured of each candidate; its flights are consecutive runs."""
     measurements = []
     for k, gains in enumerate(candidates):
@@ -242,15 +242,15 @@ class _Study:
         """Search for the best gains on some seeds."""
         from scipy.optimize import NonlinearConstraint, differential_evolution
 
-        before = self._fly([self.screen.gains], seeds)[0]
+        before = self._fly_round([self.screen.gains], seeds)[0]
         rng = np.random.default_rng(self.seed)
         with suppress(_SpentError):
             differential_evolution(
                 lambda x: math.nan,  # unused: `workers` flies a whole generation
                 [(0.0, 1.0)] * len(self.space.own),
-                init=feasible_points(self.space, self.slack, _POPULATION, rng),
+                init=feasible_points(self.space, self.margin_slack, _POPULATION, rng),
                 constraints=NonlinearConstraint(
-                    lambda x: self.slack(self.space.gains(x)), 0.0, math.inf
+                    lambda x: self.margin_slack(self.space.gains_at(x)), 0.0, math.inf
                 ),
                 workers=lambda _, points: self._costs(points, seeds),
                 updating="deferred",
@@ -260,8 +260,8 @@ class _Study:
                 polish=False,
                 rng=rng,
             )
-        best = min(self.flown.values(), key=lambda flown: cost(flown, self.metric))
-        margins = self.screen.own, self.screen.margins(best.gains)
+        best = min(self.flown.values(), key=lambda flown: objective_cost(flown, self.metric))
+        margins = self.screen.own, self.screen.margins_by_law(best.gains)
         refused = sum(slack < 0 for slack in self.slacks.values())
         return Tuned(
             self.mission.name, self.objective, self.metric, before, best, margins,
@@ -277,34 +277,34 @@ class _Study:
         self.total = int(self.before[0]) + len(pair) * len(seeds)
         for key, gains in pair.items():
             folder = self.folder / _VALIDATION / f"{every.index(key):04}"
-            judged += self._sweep([gains], seeds, folder)
+            judged += self._fly_as_sweep([gains], seeds, folder)
         tuned.validation = judged[0], judged[-1]
 
-    def slack(self, gains: Gains) -> float:
+    def margin_slack(self, gains: Gains) -> float:
         """Slack of the margins; computed once."""
         key = _gain_values(gains)
         if key not in self.slacks:
-            self.slacks[key] = self.screen.slack(gains)
+            self.slacks[key] = self.screen.margin_slack(gains)
         return self.slacks[key]
 
     def _costs(self, points: Iterable[Floats], seeds: range) -> list[float]:
         """Costs of a generation."""
-        every = [self.space.gains(x) for x in points]
+        every = [self.space.gains_at(x) for x in points]
         new = {_gain_values(g): g for g in every if _gain_values(g) not in self.flown}
         if (len(self.flown) + len(new)) * len(seeds) > self.budget:
             raise _SpentError
         if new:
-            self._fly(list(new.values()), seeds)
-        return [cost(self.flown[_gain_values(g)], self.metric) for g in every]
+            self._fly_round(list(new.values()), seeds)
+        return [objective_cost(self.flown[_gain_values(g)], self.metric) for g in every]
 
-    def _fly(self, candidates: list[Gains], seeds: range) -> list[Flown]:
+    def _fly_round(self, candidates: list[Gains], seeds: range) -> list[Flown]:
         """Fly new candidates as the next round."""
-        flown = self._sweep(candidates, seeds, self.folder / _ROUNDS / f"{self.rounds:03}")
+        flown = self._fly_as_sweep(candidates, seeds, self.folder / _ROUNDS / f"{self.rounds:03}")
         self.rounds += 1
         self.flown |= {_gain_values(f.gains): f for f in flown}
         return flown
 
-    def _sweep(self, candidates: Sequence[Gains], seeds: range, folder: Path) -> list[Flown]:
+    def _fly_as_sweep(self, candidates: Sequence[Gains], seeds: range, folder: Path) -> list[Flown]:
         """Fly every candidate on every seed, as a sweep in a folder, and return what was measured of each."""
         grids = [("gains", path, [c[path] for c in candidates]) for path in candidates[0]]
         grids += [("seeds", path, [*seeds]) for path in self.paths]
@@ -312,13 +312,13 @@ class _Study:
         sweep = Sweep.of(self.mission, vary, name=folder.name, origin="rigidfleet tune")
         # The first sweep is flown here: it compiles what the processes find, and tells how long a flight takes.
         if self.count > 1 and self.rounds and self.pool is None:
-            self.pool = self.stack.enter_context(processes(self.count))
+            self.pool = self.stack.enter_context(start_processes(self.count))
         workers = self.count if self.pool else 1
         table = fly(sweep, folder, workers=workers, progress=self._report_progress, pool=self.pool)
         self.before, self.now = self.before + self.now, self.now * 0
         if not self.rounds and np.median(table.wall) * self.total < WORTH:
             self.count = 1
-        return _measurements(table, candidates, len(seeds))
+        return _flown_of_candidates(table, candidates, len(seeds))
 
     def _report_progress(self, now: SweepProgress) -> None:
         self.now = np.array([now.done, now.flown, now.failed])
@@ -328,7 +328,7 @@ class _Study:
             self.progress(SweepProgress(done, self.total, flown, failed, wall, self.count))
 
 
-def cost(flown: Flown, metric: str) -> float:
+def objective_cost(flown: Flown, metric: str) -> float:
     """Mean of a metric [m]; more failed flights are worse whatever it is, and early ends are worse still."""
     errors = np.nan_to_num(flown.values[metric], nan=_FAILED)
     failed = flown.flights - flown.passed
@@ -365,13 +365,13 @@ class _Claim:
             )
         make_folder(self.folder)
         if replace or not before:
-            self._write({"definition": self.definition})
+            self._write_study({"definition": self.definition})
 
     def write(self, tuned: Tuned) -> None:
         """Write the result of the study, and the tuned mission."""
         write_file(self.tuned, tuned.text.encode())
         tuned.file = self.tuned
-        self._write({"definition": self.definition, **tuned.to_dict(), "text": tuned.text})
+        self._write_study({"definition": self.definition, **tuned.to_dict(), "text": tuned.text})
 
     def _read_folder(self) -> dict[str, Any]:
         """What is in the folder."""
@@ -384,6 +384,6 @@ class _Claim:
                 f"{self.study}: cannot be read as a study ({error}). Delete it, or choose another folder by --out."
             ) from error
 
-    def _write(self, data: dict[str, Any]) -> None:
+    def _write_study(self, data: dict[str, Any]) -> None:
         text = json.dumps(data, ensure_ascii=False, allow_nan=False, indent=2) + "\n"
         write_file(self.study, text.encode())

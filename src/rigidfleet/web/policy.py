@@ -20,14 +20,14 @@ def content_policy(*, style: str, script: str | None = None, connect: str = "'no
     """
     allowed = {
         "default-src": "'none'",
-        "style-src": _digest(style),
+        "style-src": _policy_digest(style),
         "img-src": "data:",
         "base-uri": "'none'",
         "form-action": "'none'",
     }
     if script is not None:
         allowed |= {
-            "script-src": _digest(script),
+            "script-src": _policy_digest(script),
             "connect-src": connect,
             # No script can turn text into markup, either.
             "require-trusted-types-for": "'script'",
@@ -36,5 +36,5 @@ def content_policy(*, style: str, script: str | None = None, connect: str = "'no
     return "; ".join(f"{what} {who}" for what, who in allowed.items())
 
 
-def _digest(text: str) -> str:
+def _policy_digest(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

@@ -51,7 +51,7 @@ def _environment_folder() -> Path:
     """The folder named by the environment."""
     bases = (os.environ.get(x) for x in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "LOCALAPPDATA"))
     base = next(filter(None, bases), "~/.cache")
-    return Path(os.path.expanduser(base), "rigidfleet", f"kernel-{_digest()}")
+    return Path(os.path.expanduser(base), "rigidfleet", f"kernel-{_cache_digest()}")
 
 
 @cache
@@ -66,7 +66,7 @@ def sources_digest() -> str:
 
 
 @cache
-def _digest() -> str:
+def _cache_digest() -> str:
     made_by = f"{sources_digest()} {version('numba')} {sys.version}"
     return hashlib.sha256(made_by.encode()).hexdigest()[:16]
 
@@ -81,11 +81,11 @@ def open_safely(file: str | Path) -> Generator[IO[bytes]]:
         It is not there, or others could have written it.
     """
 
-    def descriptor(path: str, flags: int) -> int:
+    def open_descriptor(path: str, flags: int) -> int:
         more = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
         return os.open(path, flags | more)
 
-    with open(file, "rb", opener=descriptor) as stream:
+    with open(file, "rb", opener=open_descriptor) as stream:
         state = os.fstat(stream.fileno())
         if not stat.S_ISREG(state.st_mode):
             raise PermissionError(errno.EACCES, f"{file} is not a file")

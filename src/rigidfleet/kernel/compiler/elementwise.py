@@ -12,7 +12,7 @@ from rigidfleet.kernel.compiler.jit import OPTIONS
 from rigidfleet.solids import distance
 
 
-def _make_known(function: Callable[..., Any]) -> None:
+def _register_for_jit(function: Callable[..., Any]) -> None:
     """Let compiled functions call a function of Python."""
     overload(function, jit_options=OPTIONS, strict=False)(lambda *_: function)
 
@@ -29,4 +29,4 @@ overload(distance.any_true, jit_options=OPTIONS)(lambda test: lambda test: test)
 overload(distance.floor, jit_options=OPTIONS)(lambda x: _floor)
 
 for _function in distance.ELEMENTWISE:
-    _make_known(_function)
+    _register_for_jit(_function)

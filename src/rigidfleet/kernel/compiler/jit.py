@@ -24,7 +24,11 @@ from numba.core.ccallback import CFunc
 
 from rigidfleet._common.files import replace_atomically
 from rigidfleet.kernel.compiler.cache import cache_directory, open_safely, warn_not_cached
-from rigidfleet.kernel.compiler.levels import KEY, runnable_level, target_level
+from rigidfleet.kernel.compiler.levels import (
+    KEY,
+    runnable_instruction_level,
+    target_instruction_level,
+)
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -42,7 +46,9 @@ OPTIONS: dict[str, Any] = {
 _OPTIMISES = numba.config.OPT > 0
 _CACHED = OPTIONS | {"no_cfunc_wrapper": True}
 if os.environ.get(KEY):  # whatever Numba compiles in this process is then of this level, too
-    numba.config.CPU_NAME = runnable_level() if _OPTIMISES else target_level()
+    numba.config.CPU_NAME = (
+        runnable_instruction_level() if _OPTIMISES else target_instruction_level()
+    )
     numba.config.CPU_FEATURES = ""
 
 

@@ -28,7 +28,7 @@ KEY = "RIGIDFLEET_LEVEL"
 
 
 @cache
-def machine_levels() -> tuple[str, ...]:
+def instruction_levels() -> tuple[str, ...]:
     """The levels that this machine runs, the lowest first; none where there are no levels."""
     if sys.platform != "linux" or platform.machine() != "x86_64":
         return ()
@@ -40,12 +40,12 @@ def machine_levels() -> tuple[str, ...]:
     return tuple(takewhile(lambda name: _NEEDS[name] <= has, _NEEDS))
 
 
-def target_level() -> str:
+def target_instruction_level() -> str:
     """The level to compile for: that which the environment fixes, or the highest that the machine runs, or `HOST`."""
-    return os.environ.get(KEY) or (HOST, *machine_levels())[-1]
+    return os.environ.get(KEY) or (HOST, *instruction_levels())[-1]
 
 
-def runnable_level() -> str:
+def runnable_instruction_level() -> str:
     """The same, to run code of it.
 
     Raises
@@ -53,8 +53,8 @@ def runnable_level() -> str:
     RigidfleetError
         The environment fixes a level that is unknown, or that this machine cannot run.
     """
-    runs = machine_levels() or (HOST,)
-    if (chosen := target_level()) not in runs:
+    runs = instruction_levels() or (HOST,)
+    if (chosen := target_instruction_level()) not in runs:
         raise RigidfleetError(
             f"{KEY}: this machine cannot run {chosen!r}. Choose {' or '.join(runs)}, or unset it."
         )

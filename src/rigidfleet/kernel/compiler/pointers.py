@@ -71,7 +71,7 @@ def _count_words(kind: types.Type) -> int:
     return WIDTH if kind == lanes else 1
 
 
-def _field(kind: types.BaseNamedTuple, name: str) -> tuple[types.Type, int]:
+def _field_type_and_word(kind: types.BaseNamedTuple, name: str) -> tuple[types.Type, int]:
     """Type and first word of a field."""
     k = kind.fields.index(name)
     return kind.types[k], sum(map(_count_words, kind.types[:k]))
@@ -82,20 +82,20 @@ class _Attribute(AttributeTemplate):
     key = Pointer
 
     def generic_resolve(self, kind: Any, name: str) -> types.Type:
-        field, _ = _field(kind.to, name)
+        field, _ = _field_type_and_word(kind.to, name)
         return Pointer(field) if isinstance(field, types.BaseNamedTuple) else field
 
 
 @lower_getattr_generic(Pointer)
 def _read_field(context: Any, builder: Any, kind: Any, address: Any, name: str) -> Any:
-    field, first = _field(kind.to, name)
+    field, first = _field_type_and_word(kind.to, name)
     if isinstance(field, types.BaseNamedTuple):
         return _word_address(builder, address, first)
     if isinstance(field, types.Array):
         array = context.make_array(field)(context, builder)
         array.data = _load(builder, address, first, array.data.type)
         extents = extents_of(kind.to.instance_class).get(name, (None,) * field.ndim)
-        shape = [_extent(builder, address, first + 1 + k, x) for k, x in enumerate(extents)]
+        shape = [_load_extent(builder, address, first + 1 + k, x) for k, x in enumerate(extents)]
         return _array_at(context, builder, field, array, shape)
     if field == types.boolean:
         return builder.trunc(_load(builder, address, first), ir.IntType(1))
@@ -113,7 +113,7 @@ def _load(builder: Any, address: Any, word: int, kind: ir.Type = _WORD) -> Any:
     return loaded
 
 
-def _extent(builder: Any, address: Any, word: int, declared: int | str | None) -> Any:
+def _load_extent(builder: Any, address: Any, word: int, declared: int | str | None) -> Any:
     if isinstance(declared, int):
         return ir.Constant(_WORD, declared)
     loaded = _load(builder, address, word)
@@ -166,7 +166,7 @@ def _array_at(context: Any, builder: Any, kind: types.Array, array: Any, shape: 
     return array._getvalue()
 
 
-def pointer(to: types.BaseNamedTuple) -> Any:
+def pointer_to(to: types.BaseNamedTuple) -> Any:
     """Return the compiled function that converts an int64 to the address of a named tuple."""
 
     @intrinsic

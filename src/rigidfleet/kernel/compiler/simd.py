@@ -118,7 +118,7 @@ def _cast(context: Any, builder: Any, kind: Any, _to: Any, value: Any) -> ir.Val
     return fill_vector(builder, context.cast(builder, value, kind, types.float64))
 
 
-def _operands(context: Any, builder: Any, sig: Any, arguments: Any) -> list[ir.Value]:
+def _vector_operands(context: Any, builder: Any, sig: Any, arguments: Any) -> list[ir.Value]:
     """Arguments as vectors; a number is copied to all lanes."""
     return [
         value
@@ -128,7 +128,7 @@ def _operands(context: Any, builder: Any, sig: Any, arguments: Any) -> list[ir.V
     ]
 
 
-def _register(functions: tuple[Any, ...], arity: int, generate: Any) -> None:
+def _register_lane_functions(functions: tuple[Any, ...], arity: int, generate: Any) -> None:
     """Let functions or operators take lanes, also mixed with numbers."""
 
     class Template(AbstractTemplate):
@@ -136,7 +136,7 @@ def _register(functions: tuple[Any, ...], arity: int, generate: Any) -> None:
             return signature(lanes, *args) if len(args) == arity and lanes in args else None
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> ir.Value:
-        return generate(builder, *_operands(context, builder, sig, arguments))
+        return generate(builder, *_vector_operands(context, builder, sig, arguments))
 
     kinds = (
         [(_Lanes,)]
@@ -149,12 +149,12 @@ def _register(functions: tuple[Any, ...], arity: int, generate: Any) -> None:
             lower_builtin(function, *kind)(lower)
 
 
-def arithmetic(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, name: str) -> ir.Value:
+def build_arithmetic(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, name: str) -> ir.Value:
     """Build one of LLVM's instructions on vectors: fadd, fsub, fmul."""
     return getattr(builder, name)(a, b, flags=_FAST)
 
 
-def absolute(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
+def build_absolute(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
     """Build abs(x)."""
     return builder.call(_llvm_intrinsic(builder, "fabs", 1), [x])
 
@@ -169,11 +169,11 @@ def build_minimum(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
     return builder.select(builder.fcmp_ordered("<", a, b), a, b)
 
 
-def _multiply_add(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
+def _build_multiply_add(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
     return builder.call(_llvm_intrinsic(builder, "fma", 3), [a, b, c])
 
 
-def _machine_estimate(builder: ir.IRBuilder, name: str, x: ir.Value) -> ir.Value:
+def _build_machine_estimate(builder: ir.IRBuilder, name: str, x: ir.Value) -> ir.Value:
     mask = ir.IntType(WIDTH)
     kind = ir.FunctionType(VECTOR, [VECTOR, VECTOR, mask])
     symbol = f"llvm.x86.avx512.{name}14.pd.512"
@@ -186,7 +186,7 @@ def lane_constant(value: float) -> ir.Constant:
     return ir.Constant(VECTOR, [value] * WIDTH)
 
 
-def inverse(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
+def build_inverse(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
     """Build 1/x, exact to the last bit but one; NaN for zero, if the machine estimates quotients.
 
     Eight quotients take a wide machine as long as sixteen products. Its estimate y of 1/x, corrected
@@ -194,10 +194,10 @@ def inverse(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
     """
     if not _ESTIMATES:
         return builder.fdiv(lane_constant(1.0), x, flags=_FAST)
-    y = _machine_estimate(builder, "rcp", x)
-    e = _multiply_add(builder, builder.fneg(x), y, lane_constant(1.0))
-    power = _multiply_add(builder, e, e, e)
-    return _multiply_add(builder, y, _multiply_add(builder, power, e, e), y)
+    y = _build_machine_estimate(builder, "rcp", x)
+    e = _build_multiply_add(builder, builder.fneg(x), y, lane_constant(1.0))
+    power = _build_multiply_add(builder, e, e, e)
+    return _build_multiply_add(builder, y, _build_multiply_add(builder, power, e, e), y)
 
 
 @intrinsic
@@ -206,13 +206,13 @@ def rough_inverse(_context, x):
 
     def generate(_context: Any, builder: Any, _sig: Any, args: Any) -> ir.Value:
         if _ESTIMATES:
-            return _machine_estimate(builder, "rcp", args[0])
-        return inverse(builder, args[0])
+            return _build_machine_estimate(builder, "rcp", args[0])
+        return build_inverse(builder, args[0])
 
     return lanes(x), generate
 
 
-def inverse_root(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
+def build_inverse_root(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
     """Build 1/sqrt(x), exact to the last bit but one; NaN for zero, if the machine estimates roots.
 
     From an estimate y, with e = 1 - x y^2: y (1 + e/2 + 3 e^2/8 + 5 e^3/16).
@@ -220,14 +220,14 @@ def inverse_root(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
     if not _ESTIMATES:
         root = builder.call(_llvm_intrinsic(builder, "sqrt", 1), [x])
         return builder.fdiv(lane_constant(1.0), root, flags=_FAST)
-    y = _machine_estimate(builder, "rsqrt", x)
-    e = _multiply_add(builder, builder.fneg(builder.fmul(x, y)), y, lane_constant(1.0))
-    series = _multiply_add(builder, lane_constant(0.3125), e, lane_constant(0.375))
-    series = _multiply_add(builder, series, e, lane_constant(0.5))
-    return _multiply_add(builder, builder.fmul(y, e), series, y)
+    y = _build_machine_estimate(builder, "rsqrt", x)
+    e = _build_multiply_add(builder, builder.fneg(builder.fmul(x, y)), y, lane_constant(1.0))
+    series = _build_multiply_add(builder, lane_constant(0.3125), e, lane_constant(0.375))
+    series = _build_multiply_add(builder, series, e, lane_constant(0.5))
+    return _build_multiply_add(builder, builder.fmul(y, e), series, y)
 
 
-def root_from_inverse(builder: ir.IRBuilder, x: ir.Value, inverse_of_it: ir.Value) -> ir.Value:
+def build_root(builder: ir.IRBuilder, x: ir.Value, inverse_of_it: ir.Value) -> ir.Value:
     """Build sqrt(x) from 1/sqrt(x)."""
     zero = builder.fcmp_ordered("==", x, lane_constant(0.0))
     return builder.select(zero, x, builder.fmul(x, inverse_of_it))
@@ -240,25 +240,25 @@ def _llvm_intrinsic(builder: ir.IRBuilder, name: str, arity: int) -> ir.Function
 
 #: Builder of each operation.
 BUILD: dict[str, Any] = {
-    "add": partial(arithmetic, name="fadd"),
-    "sub": partial(arithmetic, name="fsub"),
-    "mul": partial(arithmetic, name="fmul"),
+    "add": partial(build_arithmetic, name="fadd"),
+    "sub": partial(build_arithmetic, name="fsub"),
+    "mul": partial(build_arithmetic, name="fmul"),
     "neg": ir.IRBuilder.fneg,
-    "inverse": inverse,
-    "inverse_root": inverse_root,
-    "root": root_from_inverse,
-    "abs": absolute,
+    "inverse": build_inverse,
+    "inverse_root": build_inverse_root,
+    "root": build_root,
+    "abs": build_absolute,
     "max": build_maximum,
     "min": build_minimum,
     "where_positive": lambda builder, x, a, b: builder.select(
         builder.fcmp_ordered(">", x, lane_constant(0.0)), a, b
     ),
 }
-_register((operator.add, operator.iadd), 2, BUILD["add"])
-_register((operator.sub, operator.isub), 2, BUILD["sub"])
-_register((operator.mul, operator.imul), 2, BUILD["mul"])
-_register((abs,), 1, BUILD["abs"])
-_register((max,), 2, BUILD["max"])
+_register_lane_functions((operator.add, operator.iadd), 2, BUILD["add"])
+_register_lane_functions((operator.sub, operator.isub), 2, BUILD["sub"])
+_register_lane_functions((operator.mul, operator.imul), 2, BUILD["mul"])
+_register_lane_functions((abs,), 1, BUILD["abs"])
+_register_lane_functions((max,), 2, BUILD["max"])
 
 
 @intrinsic
@@ -272,7 +272,7 @@ def fill_lanes(_context, x):
 
 
 @intrinsic
-def scatter(_context, x, addresses, offset):
+def scatter_lanes(_context, x, addresses, offset):
     """Store each lane of x at one of eight addresses (8,), plus an offset in numbers."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:

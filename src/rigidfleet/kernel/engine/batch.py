@@ -148,19 +148,19 @@ def fit_together(problems: Sequence[Problem]) -> bool:
         and x.law.solver == first.law.solver
         and x.law.iterations == first.law.iterations
         and x.control.kind == first.control.kind
-        and _blend(x.reference) == _blend(first.reference)
-        and _tables(x.disturbance) == _tables(first.disturbance)
+        and _blend_key(x.reference) == _blend_key(first.reference)
+        and _disturbance_key(x.disturbance) == _disturbance_key(first.disturbance)
         and arrays_equal(x.graph.edges, first.graph.edges)
         and arrays_equal(x.motion.knots, first.motion.knots)
         for x in problems
     )
 
 
-def _blend(reference: Reference) -> tuple[int, float, float]:
+def _blend_key(reference: Reference) -> tuple[int, float, float]:
     return reference.kind, reference.t0, reference.T_b
 
 
-def _tables(x: Disturbance) -> tuple[object, ...]:
+def _disturbance_key(x: Disturbance) -> tuple[object, ...]:
     return (
         x.active, x.gust.shape, x.noise_r.shape, x.noise_v.shape, x.gust_step, x.noise_step,
     )  # fmt: skip
@@ -288,7 +288,7 @@ def fly_all(
         return work
 
     if not vectors:
-        return _share(begin_alone, starts, before, threads)
+        return _fly_in_threads(begin_alone, starts, before, threads)
     if not fits(problem):
         raise ValueError("flights of this problem cannot share vectors; use vectors=False")
     count, n = starts.shape
@@ -299,7 +299,7 @@ def fly_all(
             x = x[np.minimum(np.arange(padded(count)), count - 1)]
         return pack(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
 
-    def begin() -> Callable[..., None]:
+    def make_worker() -> Callable[..., None]:
         K = np.zeros((lane_steps.ROWS, n, WIDTH))
         K[lane_steps.ATOL] = atol[:, None]
         y, clock, counts = (
@@ -313,23 +313,23 @@ def fly_all(
             stage=ready.stage.copy(),
         )  # fmt: skip
 
-        def work(*part: Any) -> None:
+        def fly_range(*part: Any) -> None:
             fly(own, state, *times, _FIRST_STEP_IN_VECTORS, *part, max_steps, True)
 
-        return work
+        return fly_range
 
-    ends = _share(begin, in_lanes(starts), in_lanes(before), threads)
+    ends = _fly_in_threads(make_worker, in_lanes(starts), in_lanes(before), threads)
     y = unpack(ends.y).swapaxes(1, 2).reshape(-1, n)[:count]
     finished = np.repeat(ends.finished, WIDTH)[:count]
     evaluations = np.repeat(ends.evaluations, WIDTH)[:count]
     lost = ~finished
     if lost.any():
-        again = _share(begin_alone, starts[lost], before[lost], threads)
+        again = _fly_in_threads(begin_alone, starts[lost], before[lost], threads)
         y[lost], finished[lost], evaluations[lost] = again.y, again.finished, again.evaluations
     return FinalStates(y, finished, evaluations)
 
 
-def _share(
+def _fly_in_threads(
     begin: Callable[[], Callable[..., None]], starts: Floats, before: Floats, threads: int
 ) -> FinalStates:
     """Distribute flights, or vectors of them, over threads; each thread calls `begin` for its own data."""
@@ -340,15 +340,15 @@ def _share(
     size = max(1, -(-count // (threads * _RANGES)))
     ranges = iter(range(0, count, size))
 
-    def work() -> None:
+    def fly_share() -> None:
         fly_part = begin()
         for first in ranges:
             part = slice(first, first + size)
             fly_part(starts[part], before[part], ends[part], status[part], evaluations[part])
 
     with ThreadPoolExecutor(max(1, threads - 1)) as pool:  # this thread works, too
-        jobs = [pool.submit(work) for _ in range(threads - 1)]
-        work()
+        jobs = [pool.submit(fly_share) for _ in range(threads - 1)]
+        fly_share()
         for job in jobs:
             job.result()
     return FinalStates(ends, status == FINISHED, evaluations)

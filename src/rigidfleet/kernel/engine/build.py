@@ -29,7 +29,7 @@ from rigidfleet.kernel import (
 )
 from rigidfleet.kernel.avoidance import AvoidanceArrays
 from rigidfleet.kernel.compiler.jit import OPTIONS
-from rigidfleet.kernel.compiler.pointers import Pointer, keep_extents, pointer, set_extents
+from rigidfleet.kernel.compiler.pointers import Pointer, keep_extents, pointer_to, set_extents
 from rigidfleet.kernel.engine import objects, packing
 from rigidfleet.kernel.measured import Measured
 from rigidfleet.kernel.problem import Problem, Workspace
@@ -71,7 +71,7 @@ def flight_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]:
         )
 
     def record_segment(p, w, call, out):
-        recorder.record(call.times, call.samples, p, w, call.dy, out, call.first)
+        recorder.write_record(call.times, call.samples, p, w, call.dy, out, call.first)
         return 0
 
     keep_extents()
@@ -95,8 +95,8 @@ def monitor_code() -> list[bytes]:
         ("bound_moves", lambda p, s, m: monitor.bound_changes(p, s, m), *watched),
         ("watch_distances", lambda i, j, p, s, m: monitor.watch_distances(i, j, p, s, m), word, word, *watched),
         ("watch_forces", lambda last, p, w, s, m: monitor.watch_forces(last, p, w, s, m), word, *with_law),
-        ("measure", lambda m: measurement.measure(m), Measured),
-        ("follow", lambda s: recursion.recurse(s), Recursion),
+        ("measure", lambda m: measurement.measure_samples(m), Measured),
+        ("follow", lambda s: recursion.run_linear_recursion(s), Recursion),
     )  # fmt: skip
     return [_object_code(*_module(*call), name) for name, *call in calls]
 
@@ -117,7 +117,7 @@ def avoidance_code() -> list[bytes]:
     """Object code of avoidance in flight."""
     from rigidfleet.kernel import guard
 
-    problem, workspace = (pointer(_type_of(kind)) for kind in (Problem, Workspace))
+    problem, workspace = (pointer_to(_type_of(kind)) for kind in (Problem, Workspace))
 
     def avoid(f, s, a, _):
         return guard.guard_forces(problem(a.law[0]), workspace(a.law[1]), f, s, a)
@@ -131,7 +131,7 @@ def solids_code() -> list[bytes]:
     """Object code of the monitor of obstacles that move or are no plain boxes."""
     from rigidfleet.kernel.obstacles import watch_step
 
-    row_of = monitor.row_of
+    row_of = monitor.trail_row_of
 
     def watch_solids(first, end, p, state, watch, s):
         for step in range(first, end):
@@ -188,7 +188,7 @@ def _object_code(
 ) -> bytes:
     """Object code of a module of which ``symbol`` alone, the function ``name``, is called; see `set_extents`."""
     module = _simplify(set_extents(text, sizes), symbol, name, hot)
-    builder = _passes(3)
+    builder = _pass_builder(3)
     builder.getModulePassManager().run(module, builder)
     for function in module.functions:
         if function.is_declaration and function.name.startswith(("numba_", "NRT_", "Py")):
@@ -205,7 +205,7 @@ def _simplify(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) ->
     inlined = tuple(f"{len(name)}{name}B" for name in hot)  # as in Numba's mangled names
     for thing in (*module.functions, *module.global_variables):
         if thing.name == symbol:
-            thing.name, thing.linkage = objects.symbol(name), "external"
+            thing.name, thing.linkage = objects.symbol_name(name), "external"
         elif not thing.is_declaration:
             thing.linkage = "internal"
             if thing.is_function and any(name in thing.name for name in inlined):
@@ -214,11 +214,11 @@ def _simplify(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) ->
     quick = llvm.create_new_module_pass_manager()
     for add in _QUICK:
         getattr(quick, f"add_{add}_pass")()
-    quick.run(module, _passes(1))
+    quick.run(module, _pass_builder(1))
     return module
 
 
-def _passes(level: int) -> Any:
+def _pass_builder(level: int) -> Any:
     options = llvm.create_pipeline_tuning_options(speed_level=level)
     # Most loops are short, and the integrator's sums use vectors already
     options.loop_vectorization = False
@@ -234,4 +234,4 @@ def main(part: str) -> None:
             objects.build_command("apart"), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
         )
         codes = flight_code(second)
-    sys.stdout.buffer.write(objects.concatenate(codes))
+    sys.stdout.buffer.write(objects.join_objects(codes))

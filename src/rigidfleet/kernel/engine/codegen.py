@@ -79,7 +79,7 @@ def unrolled(problem: Problem) -> UnrolledProblem:
         The problem has branches that depend on the state.
     """
     description, values, _ = structure(problem)
-    return _prepare(problem, description, values[:, None], lambda: Trace(problem))
+    return _prepare_unrolled(problem, description, values[:, None], lambda: Trace(problem))
 
 
 def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> UnrolledProblem:
@@ -98,7 +98,7 @@ def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> Un
     sizes = np.abs(unpack(motion)).reshape(-1, 6, 6 * WIDTH).max(axis=(0, 2))
     moves = (sizes > _STILL).tolist()
     description = flight_structure(first, values, moves)
-    ready = _prepare(first, description, values, lambda: FlightTrace(first, values, moves))
+    ready = _prepare_unrolled(first, description, values, lambda: FlightTrace(first, values, moves))
     return ready._replace(
         before=packed([p.reference.d0 for p in problems]), knots=first.motion.knots, motion=motion,
         **tables,
@@ -135,13 +135,13 @@ def addresses(arrays: Sequence[Floats]) -> Ints:
     return np.array([x.ctypes.data for x in arrays])
 
 
-def _prepare(
+def _prepare_unrolled(
     problem: Problem, description: bytes, values: Floats, trace: Callable[[], Trace]
 ) -> UnrolledProblem:
     name = hashlib.sha256(description).hexdigest()[:16]
     if name not in _KNOWN:
         code = Code(trace())
-        _KNOWN[name] = code, _compile(code, name), _compile_before(code, name)
+        _KNOWN[name] = code, _compile(code, name), _compile_flight_constants(code, name)
     code, address, before = _KNOWN[name]
     uniform, distinct = (
         simd.empty((len(code.inputs),)),
@@ -168,7 +168,7 @@ OF_MOMENT, OF_GAUGE = 1, 2
 
 
 @intrinsic
-def _call_code(
+def _call_unrolled_code(
     _context, address, wanted, y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v
 ):  # fmt: skip
     """Call straight-line code with the data of arrays."""
@@ -206,7 +206,7 @@ def _closed_loop(t, y, dy, p, w):
             )
     if stage == 0 or stage == lane_steps.STAGES - 1:  # the start, the middle and the end of a step
         wanted += OF_GAUGE
-    _call_code(
+    _call_unrolled_code(
         p.address, wanted, y, dy, p.gauge, p.uniform, p.before, time, p.known, p.motion[piece:], p.gust[gust:],
         p.noise_r[noise:], p.noise_v[noise:],
     )  # fmt: skip
@@ -222,13 +222,13 @@ integrate = compiled_copy(
 )
 
 
-def _lines(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted):
+def _code_lines(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted):
     """Straight-line code: each copy of `_derivative` has its own."""
     raise NotImplementedError
 
 
 def _derivative(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted):
-    _lines(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted)
+    _code_lines(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted)
 
 
 #: Number of arrays that the code takes, and ``wanted``, bits in the form of an address.
@@ -243,7 +243,7 @@ def _compile(code: Code, name: str) -> int:
         _context, y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted
     ):
         def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
-            builder.call(_emit(builder.module, code), arguments)
+            builder.call(_emit_code(builder.module, code), arguments)
             return context.get_dummy_value()
 
         kinds = y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted
@@ -252,28 +252,28 @@ def _compile(code: Code, name: str) -> int:
     return compiled_for_c(_derivative, f"derivative_{name}", arguments=_ARGUMENTS, _lines=lines)
 
 
-def _numbers_before(numbers, uniform):
+def _flight_constants(numbers, uniform):
     """What depends on a problem's numbers alone: each copy of `_before` has its own."""
     raise NotImplementedError
 
 
 def _before(numbers, uniform):
-    _numbers_before(numbers, uniform)
+    _flight_constants(numbers, uniform)
 
 
-def _compile_before(code: Code, name: str) -> Callable[[int, int], None]:
+def _compile_flight_constants(code: Code, name: str) -> Callable[[int, int], None]:
     """Compile what is known before a flight: a function of the addresses of numbers (D,) and inputs (U,), in lanes."""
 
     @intrinsic
     def numbers_before(_context, source, uniform):
         def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
             numbers, inputs = arguments
-            load = lambda b, x: b.load(_element(b, numbers, x.arguments[0]), align=8)  # noqa: E731
-            value = _value_of(builder, load)
+            load = lambda b, x: b.load(_element_address(b, numbers, x.arguments[0]), align=8)  # noqa: E731
+            value = _symbol_evaluator(builder, load)
             for x in code.before:
                 value(x)
             for index, x in enumerate(code.inputs):
-                builder.store(value(x), _element(builder, inputs, index), align=8)
+                builder.store(value(x), _element_address(builder, inputs, index), align=8)
             return context.get_dummy_value()
 
         return types.void(source, uniform), generate
@@ -282,13 +282,13 @@ def _compile_before(code: Code, name: str) -> Callable[[int, int], None]:
     return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address)
 
 
-def _element(builder: ir.IRBuilder, array: ir.Value, index: int) -> ir.Value:
+def _element_address(builder: ir.IRBuilder, array: ir.Value, index: int) -> ir.Value:
     """Place of lanes in an array."""
     vectors = builder.bitcast(array, VECTOR.as_pointer())
     return builder.gep(vectors, [ir.Constant(ir.IntType(64), index)])
 
 
-def _value_of(
+def _symbol_evaluator(
     builder: ir.IRBuilder,
     load: Callable[[ir.IRBuilder, Symbol], ir.Value],
     known: Sequence[Symbol] = (),
@@ -313,7 +313,7 @@ def _value_of(
     return value
 
 
-def _emit(module: ir.Module, code: Code) -> ir.Function:
+def _emit_code(module: ir.Module, code: Code) -> ir.Function:
     """Write the code as a function of the arguments of `_derivative`."""
     pointer = ir.DoubleType().as_pointer()
     kind = ir.FunctionType(ir.VoidType(), [pointer] * _ARGUMENTS)
@@ -338,11 +338,11 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
                 array = rows[which]
             case operation, index:
                 array = {"y": y, "before": before}[operation]
-        return builder.load(_element(builder, array, index), align=8)
+        return builder.load(_element_address(builder, array, index), align=8)
 
     def load_known(builder: ir.IRBuilder, x: Symbol) -> ir.Value:
         if x.serial in shared:
-            return builder.load(_element(builder, known, shared[x.serial]), align=8)
+            return builder.load(_element_address(builder, known, shared[x.serial]), align=8)
         return load(builder, x)
 
     names = "asked", "moment", "state", "gauge", "end"
@@ -357,15 +357,15 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
 
     branch(ir.IRBuilder(entry), OF_MOMENT, of_moment, of_state)
     builder = ir.IRBuilder(of_moment)
-    value = _value_of(builder, load, code.inputs)
+    value = _symbol_evaluator(builder, load, code.inputs)
     for x in code.moment:
         value(x)
     for index, x in enumerate(code.known):
-        builder.store(value(x), _element(builder, known, index), align=8)
+        builder.store(value(x), _element_address(builder, known, index), align=8)
     builder.branch(of_state)
 
     builder.position_at_end(of_state)
-    value = _value_of(builder, load_known, code.inputs + code.known)
+    value = _symbol_evaluator(builder, load_known, code.inputs + code.known)
     for x in code.lines:
         value(x)
     whole = [builder.fcmp_ordered(">", value(x), simd.lane_constant(0.0)) for x in code.positive]
@@ -376,14 +376,14 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
         if index == code.coordinates:  # one state without a derivative is enough
             for good in whole:
                 result = builder.select(good, result, simd.lane_constant(float("nan")))
-        builder.store(result, _element(builder, dy, index), align=8)
+        builder.store(result, _element_address(builder, dy, index), align=8)
     branch(builder, OF_GAUGE, of_gauge, end)
 
     builder.position_at_end(of_gauge)
     for x in code.last:
         value(x)
     for index, x in enumerate(code.gauge):
-        builder.store(value(x), _element(builder, gauge, index), align=8)
+        builder.store(value(x), _element_address(builder, gauge, index), align=8)
     builder.branch(end)
     ir.IRBuilder(end).ret_void()
     return function

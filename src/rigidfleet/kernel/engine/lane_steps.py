@@ -20,7 +20,7 @@ step, and forces are known at its middle, too. This takes one more evaluation.
 import numpy as np
 
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
-from rigidfleet.kernel.compiler.simd import scatter
+from rigidfleet.kernel.compiler.simd import scatter_lanes
 from rigidfleet.kernel.dopri5 import step_to_knot
 from rigidfleet.kernel.dynamics import closed_loop
 from rigidfleet.kernel.records import EVALUATIONS, FIRST_ROW, SAMPLES, TRAILED
@@ -87,7 +87,7 @@ def forget_stages(k, first):
 
 
 @jit_inline
-def _sum(k, q, w, first, end):
+def _weighted_stage_sum(k, q, w, first, end):
     """Sum of w_j k[j, q] over stage 0 and the stages from ``first`` to before ``end``, literals."""
     total = w[0] * k[0, q]
     for s in range(first, end):
@@ -114,11 +114,11 @@ def _write_state(k, row, coordinates, w, x, hc, s):
         v = k[STATE, i]
         r = k[STATE, q] + hc * v
         if s > 1:
-            r += _sum(k, i, x, of_positions, s - 1)
-        k[row, i] = v + _sum(k, i, w, of_rates, s)
+            r += _weighted_stage_sum(k, i, x, of_positions, s - 1)
+        k[row, i] = v + _weighted_stage_sum(k, i, w, of_rates, s)
         k[row, q] = r
     for q in range(2 * coordinates, k.shape[1]):
-        k[row, q] = k[STATE, q] + _sum(k, q, w, of_rates, s)
+        k[row, q] = k[STATE, q] + _weighted_stage_sum(k, q, w, of_rates, s)
 
 
 @jit_inline
@@ -175,10 +175,10 @@ def squared_errors(k, h, rtol, p):
     v, r = _weights(E, h), _weights(_EA, h * h)
     for q in range(coordinates):
         i = coordinates + q
-        squares += _squared_error(k, q, _sum(k, i, r, 3, STAGES - 1), rtol)
-        squares += _squared_error(k, i, _sum(k, i, v, 3, STAGES), rtol)
+        squares += _squared_error(k, q, _weighted_stage_sum(k, i, r, 3, STAGES - 1), rtol)
+        squares += _squared_error(k, i, _weighted_stage_sum(k, i, v, 3, STAGES), rtol)
     for q in range(2 * coordinates, k.shape[1]):
-        squares += _squared_error(k, q, _sum(k, q, v, 3, STAGES), rtol)
+        squares += _squared_error(k, q, _weighted_stage_sum(k, q, v, 3, STAGES), rtol)
     return squares
 
 
@@ -211,11 +211,11 @@ def _write_halves(k, q, slopes, h, early, late):
 
 
 @jit
-def keep_forces(p, state, array, row):
+def record_trail_forces(p, state, array, row):
     """Write the forces that the code has evaluated into a row of an array of each flight's trail."""
     forces, addresses = state.trail.gauge.shape[1], p.trails[array]
     for g in range(forces):
-        scatter(p.gauge[g], addresses, forces * row + g)
+        scatter_lanes(p.gauge[g], addresses, forces * row + g)
 
 
 @jit
@@ -230,13 +230,13 @@ def keep_step(t, h, p, w, state):
     # already, as those of the last stage; the code for the middle overwrites them, so they are stored first.
     row = (state.count[FIRST_ROW] + state.count[TRAILED]) % rows
     after = (row + 1) % rows
-    keep_forces(p, state, GAUGE, after)
+    record_trail_forces(p, state, GAUGE, after)
     w_half, x_half = _weights(HALF, h), _weights(_HALF_A, h * h)
     _write_state(k, MIDDLE, coordinates, w_half, x_half, 0.5 * h, STAGES)
     p.stage[0] = 0  # forces are asked for, as at a start
     closed_loop(t + 0.5 * h, k[MIDDLE], k[SLOPE], p, w)
     state.count[EVALUATIONS] += 1
-    keep_forces(p, state, GAUGE, row)
+    record_trail_forces(p, state, GAUGE, row)
     early, late = p.halves[0], p.halves[1]
     for q in range(coordinates):
         i = coordinates + q
@@ -245,18 +245,18 @@ def keep_step(t, h, p, w, state):
         _write_halves(k, q, (k[0, q], k[SLOPE, q], k[STAGES - 1, q]), h, early, late)
     for half in range(2):
         place = row if half == 0 else after
-        scatter(fill_lanes(t + half * 0.5 * h), trails[CLOCK], 2 * place)
-        scatter(fill_lanes(0.5 * h), trails[CLOCK], 2 * place + 1)
+        scatter_lanes(fill_lanes(t + half * 0.5 * h), trails[CLOCK], 2 * place)
+        scatter_lanes(fill_lanes(0.5 * h), trails[CLOCK], 2 * place + 1)
         for i in range(5):
             for q in range(n):
-                scatter(p.halves[half, i, q], trails[POINTS], (5 * place + i) * n + q)
+                scatter_lanes(p.halves[half, i, q], trails[POINTS], (5 * place + i) * n + q)
     state.count[TRAILED] += 2
 
 
 @jit
 def keep_start(p, w, state):
     """As `dopri5.keep_start`, for each flight into its own trail."""
-    keep_forces(p, state, START, 0)
+    record_trail_forces(p, state, START, 0)
 
 
 @jit
@@ -274,7 +274,7 @@ def keep_samples(t, h, t_new, times, samples, p, state):
                 (z * z) * points[0, q] + (4.0 * x * z) * points[1, q] + (6.0 * x * x) * points[2, q]
             )
             value += (x * x * x) * ((4.0 * z) * points[3, q] + x * points[4, q])
-            scatter(value, p.samples, n * count[SAMPLES] + q)
+            scatter_lanes(value, p.samples, n * count[SAMPLES] + q)
         count[SAMPLES] += 1
 
 

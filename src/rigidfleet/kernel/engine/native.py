@@ -27,14 +27,18 @@ from rigidfleet.kernel.compiler.cache import (
     warn_not_cached,
     warned,
 )
-from rigidfleet.kernel.compiler.levels import HOST, runnable_level, target_level
+from rigidfleet.kernel.compiler.levels import (
+    HOST,
+    runnable_instruction_level,
+    target_instruction_level,
+)
 from rigidfleet.kernel.engine.objects import (
     ENTRIES,
-    concatenate,
-    objects_of,
+    compile_objects,
+    join_objects,
     shared_object_path,
     split_objects,
-    symbol,
+    symbol_name,
     target_machine,
 )
 from rigidfleet.kernel.engine.packing import (
@@ -43,7 +47,7 @@ from rigidfleet.kernel.engine.packing import (
     UNRECORDED,
     Packed,
     pack,
-    pack_anew,
+    pack_uncached,
 )
 from rigidfleet.kernel.measured import Measured
 from rigidfleet.kernel.problem import (
@@ -74,7 +78,7 @@ class Integration:
         times: Floats,
         samples: Floats,
     ) -> None:
-        self._segment = pack_anew(Segment(t_end, False, 0, times, samples, NOTHING))
+        self._segment = pack_uncached(Segment(t_end, False, 0, times, samples, NOTHING))
         self._kept = pack(problem), pack(workspace), pack(state), self._segment
         self._addresses = [x.address for x in self._kept]
         code, graph = library(), problem.graph
@@ -91,7 +95,7 @@ class Integration:
 def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
     """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s]."""
     out = new_record(len(times), len(problem.vehicles.m), len(problem.graph.edges))
-    record_into(pack_anew(out), 0, pack(problem), workspace, times, samples)
+    record_into(pack_uncached(out), 0, pack(problem), workspace, times, samples)
     return out
 
 
@@ -100,7 +104,7 @@ def record_into(
 ) -> None:
     """`record` into a `Record` from row ``first`` on; it and the problem are packed."""
     segment = Segment(0.0, False, 0, times, samples, np.empty(samples.shape[1]), first)
-    _call(library().record, problem, pack(workspace), pack_anew(segment), out)
+    _call_packed(library().record, problem, pack(workspace), pack_uncached(segment), out)
 
 
 class Watch:
@@ -110,14 +114,14 @@ class Watch:
         # The recorder evaluates the law, at the monitor's own time and state.
         n = monitor.states.shape[1]
         segment = Segment(0.0, False, 0, monitor.time, monitor.states, np.empty(n))
-        self._kept = pack_anew(segment), pack(UNRECORDED)
+        self._kept = pack_uncached(segment), pack(UNRECORDED)
         self.monitor = monitor._replace(
             recorder=recorder_address(), segment=self._kept[0].address, record=self._kept[1].address
         )
-        self._packed = pack_anew(self.monitor)
+        self._packed = pack_uncached(self.monitor)
         self.address = self._packed.address
 
-    def bound_moves(self, problem: Problem, state: IntegratorState) -> None:
+    def bound_distance_changes(self, problem: Problem, state: IntegratorState) -> None:
         """Bound how far distances change over the first step, into ``monitor.moves``."""
         library().bound_moves(pack(problem).address, pack(state).address, self.address)
 
@@ -126,14 +130,14 @@ class Watch:
         of = pack(problem).address, pack(state).address, self.address
         library().watch_distances(first, end, *of)
 
-    def clearances(
+    def search_clearances(
         self, problem: Problem, state: IntegratorState, first: int, end: int, solids: Solids
     ) -> None:
         """Search the same steps for clearances to all ``solids``, see `rigidfleet.kernel.obstacles`."""
         of = pack(problem).address, pack(state).address, self.address
         library("solids").watch_solids(first, end, *of, pack(solids).address)
 
-    def forces(
+    def search_forces(
         self, problem: Problem, workspace: Workspace, state: IntegratorState, *, last: bool
     ) -> None:
         """Search all steps for extremes of forces; ``last``: no further step of the segment follows."""
@@ -143,32 +147,34 @@ class Watch:
 
 def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Workspace) -> None:
     """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dynamics.closed_loop`."""
-    segment = pack_anew(Segment(0.0, False, 0, np.array([t]), np.array([y]), dy))
-    _call(library().record, pack(problem), pack(workspace), segment, pack(UNRECORDED))
+    segment = pack_uncached(Segment(0.0, False, 0, np.array([t]), np.array([y]), dy))
+    _call_packed(library().record, pack(problem), pack(workspace), segment, pack(UNRECORDED))
 
 
-def _call(function: Any, *arguments: Packed) -> int:
+def _call_packed(function: Any, *arguments: Packed) -> int:
     return function(*[a.address for a in arguments])
 
 
-def measure(measured: Measured) -> None:
+def measure_samples(measured: Measured) -> None:
     """Measure the samples of a flight, see `rigidfleet.kernel.measurement.measure`."""
-    _call(library().measure, pack_anew(measured))
+    _call_packed(library().measure, pack_uncached(measured))
 
 
-def recurse(x: Floats, a: Floats, *, backward: bool = False) -> None:
+def run_linear_recursion(x: Floats, a: Floats, *, backward: bool = False) -> None:
     """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward, see `rigidfleet.kernel.recursion.recurse`."""
-    _call(library().follow, pack_anew(Recursion(x, a, backward)))
+    _call_packed(library().follow, pack_uncached(Recursion(x, a, backward)))
 
 
-def recurse_multiples(y: Floats, first: int, b: Floats, x: Floats, a: Floats) -> None:
+def run_scaled_recursions(y: Floats, first: int, b: Floats, x: Floats, a: Floats) -> None:
     """x_k = b_k y_k + a_k x_(k-1) in rows x (K, M), from the M columns of y (K, C) that begin with ``first``."""
-    _call(library().follow, pack_anew(Recursion(x, a, False, y, first, b)))
+    _call_packed(library().follow, pack_uncached(Recursion(x, a, False, y, first, b)))
 
 
 def call_large(name: str, *arguments: Any) -> float:
     """Call a function of `rigidfleet.kernel.elimination` or `rigidfleet.kernel.block_cholesky` with its arguments."""
-    return _call(getattr(library("large"), name), pack_anew(OF_LARGE[name]._make(arguments)))
+    return _call_packed(
+        getattr(library("large"), name), pack_uncached(OF_LARGE[name]._make(arguments))
+    )
 
 
 class Library(SimpleNamespace):
@@ -193,32 +199,32 @@ def library(part: str = "flight") -> Library:
     if part not in _loaded:
         with _loading:
             if part not in _loaded:
-                _loaded[part] = _load(part)
+                _loaded[part] = _load_library(part)
     return _loaded[part]
 
 
-def _load(part: str) -> Library:
+def _load_library(part: str) -> Library:
     for file in _shipped_code(sources_digest()):
-        return _link(part, *_load_shared_object(file))
+        return _make_library(part, *_load_shared_object(file))
     if (parts := _read_cached_code(part)) is not None:
-        return _link(part, *_link_objects(parts))
+        return _make_library(part, *_link_objects(parts))
     if _shipped_code("*"):
         warnings.warn(
             "the kernel's sources were changed since its machine code was made: they are compiled again",
             RuntimeWarning,
             stacklevel=2,
         )
-    parts = _compile(part)
-    return _link(part, *_link_objects(parts), None if _cache_code(parts, part) else parts)
+    parts = _compile_part(part)
+    return _make_library(part, *_link_objects(parts), None if _cache_code(parts, part) else parts)
 
 
-def _link(
+def _make_library(
     part: str, engine: Any, address_of: Callable[[str], int], unkept: list[bytes] | None = None
 ) -> Library:
     """Make a library of the functions of a part, whose code the ``engine`` keeps alive."""
     word = ctypes.c_int64
     result = ctypes.c_double if part == "large" else word
-    addresses = {name: address_of(symbol(name)) for name in ENTRIES[part]}
+    addresses = {name: address_of(symbol_name(name)) for name in ENTRIES[part]}
     calls = {
         name: ctypes.CFUNCTYPE(result, *(word,) * words)(addresses[name])
         for name, words in ENTRIES[part].items()
@@ -256,17 +262,17 @@ def code_to_inherit() -> Inheritance:
     return Inheritance({part: code for part, code in unkept.items() if code}, warned.is_set())
 
 
-def inherit(inheritance: Inheritance) -> None:
+def inherit_code(inheritance: Inheritance) -> None:
     """Take over the code and warnings of the parent process."""
     if inheritance.warned:
         warned.set()
     for part, code in inheritance.code.items():
-        _loaded[part] = _link(part, *_link_objects(code), code)
+        _loaded[part] = _make_library(part, *_link_objects(code), code)
 
 
-def _compile(part: str) -> list[bytes]:
+def _compile_part(part: str) -> list[bytes]:
     """Compile the kernel, or another library (``part``), in a separate process if possible."""
-    if (parts := objects_of(part, target_level())) is not None:
+    if (parts := compile_objects(part, target_instruction_level())) is not None:
         return parts
     from rigidfleet.kernel.engine import build
 
@@ -281,7 +287,7 @@ def _shipped_code(digest: str) -> list[Path]:
     RigidfleetError
         The environment fixes a level that this machine cannot run.
     """
-    file = shared_object_path(runnable_level(), digest)
+    file = shared_object_path(runnable_instruction_level(), digest)
     return list(file.parent.glob(file.name))
 
 
@@ -293,7 +299,7 @@ def _cache_file(part: str) -> Path:
     OSError
         As `cache_directory` does.
     """
-    if (machine := target_level()) == HOST:
+    if (machine := target_instruction_level()) == HOST:
         import llvmlite.binding as llvm
 
         host = f"{llvm.get_process_triple()} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
@@ -314,7 +320,7 @@ def _cache_code(parts: Sequence[bytes], part: str) -> bool:
     """Store machine code in the cache, or warn that it will be compiled again."""
     try:
         with replace_atomically(_cache_file(part), private=True) as stream:
-            stream.write(concatenate(parts))
+            stream.write(join_objects(parts))
     except OSError as error:
         warn_not_cached(error)
         return False

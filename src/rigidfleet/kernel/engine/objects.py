@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from rigidfleet.kernel.compiler.levels import HOST, KEY, target_level
+from rigidfleet.kernel.compiler.levels import HOST, KEY, target_instruction_level
 
 #: The functions of each library of machine code, by name, with how many words they take: integers, or addresses of
 #: named tuples. They return a word. Flights of points load the first library, those of vehicles the second, too, those
@@ -40,7 +40,7 @@ ENTRIES = {
 }  # fmt: skip
 
 
-def symbol(name: str) -> str:
+def symbol_name(name: str) -> str:
     """Name of a function in machine code."""
     return f"rigidfleet_{name}"
 
@@ -73,7 +73,7 @@ def shared_object_path(of: str, digest: str) -> Path:
     return Path(__file__).with_name(f"{of}-{digest}.so")
 
 
-def objects_of(part: str, of: str) -> list[bytes] | None:
+def compile_objects(part: str, of: str) -> list[bytes] | None:
     """Objects of a part for a level, made by a process of its own; None if there can be no such process, or it fails.
 
     In that process Numba only translates. Otherwise it would optimise each function before all are optimised
@@ -100,14 +100,14 @@ def target_machine() -> Any:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     target = llvm.Target.from_default_triple()
-    if (cpu := target_level()) != HOST:  # code that a linker takes, too
+    if (cpu := target_instruction_level()) != HOST:  # code that a linker takes, too
         return target.create_target_machine(cpu=cpu, opt=3, reloc="pic", codemodel="small")
     return target.create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=3, jit=True
     )  # fmt: skip
 
 
-def concatenate(parts: Sequence[bytes]) -> bytes:
+def join_objects(parts: Sequence[bytes]) -> bytes:
     """Join objects, each after its length, with a digest, so that an incomplete file is never used."""
     code = b"".join(len(part).to_bytes(8, "little") + part for part in parts)
     return code + hashlib.sha256(code).digest()

@@ -14,7 +14,7 @@ import numpy as np
 
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.avoidance import AvoidanceArrays, avoidance_arrays
-from rigidfleet.kernel.measured import Measured, measurement_of
+from rigidfleet.kernel.measured import Measured, measurement_arrays
 from rigidfleet.kernel.problem import (
     CONSTANT,
     ITERATED,
@@ -41,7 +41,7 @@ from rigidfleet.kernel.records import (
     Recursion,
     Segment,
     integrator,
-    monitor,
+    new_monitor,
     new_record,
 )
 from rigidfleet.solids.records import Solids, half_space, one_solid
@@ -56,14 +56,14 @@ class Packed(NamedTuple):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy has words of its own: the arrays of the tuple lie elsewhere."""
-        return pack_anew, (self.of,)
+        return pack_uncached, (self.of,)
 
 
 #: By it, an array's address is read five times as fast as by `__array_interface__`: packing is a part of every flight.
 _buffer = (ctypes.c_char * 0).from_buffer
 
 
-def _flat(x: Any) -> tuple[Any, list[Any], list[Any]]:
+def _flatten_tuple(x: Any) -> tuple[Any, list[Any], list[Any]]:
     """A named tuple, the kinds of its numbers and arrays, and its words."""
     kinds: list[Any] = []
     words: list[Any] = []
@@ -81,7 +81,7 @@ def _flat(x: Any) -> tuple[Any, list[Any], list[Any]]:
             words.append(value)
             kinds.append(float)
         elif isinstance(value, tuple):
-            _, own, inside = _keep(_flat, value)
+            _, own, inside = _memoise_last(_flatten_tuple, value)
             kinds += own
             words += inside
         else:
@@ -90,7 +90,7 @@ def _flat(x: Any) -> tuple[Any, list[Any], list[Any]]:
     return x, kinds, words
 
 
-def pack_anew(x: Any) -> Packed:
+def pack_uncached(x: Any) -> Packed:
     """Convert a named tuple to words.
 
     Raises
@@ -98,8 +98,8 @@ def pack_anew(x: Any) -> Packed:
     TypeError
         Numbers or arrays are not of the types that the kernel is compiled for.
     """
-    _, kinds, values = _flat(x)
-    expected, code = _layout(type(x))
+    _, kinds, values = _flatten_tuple(x)
+    expected, code = _word_layout(type(x))
     if kinds != expected:
         raise TypeError(
             f"this {type(x).__name__} has arrays or numbers of types that the kernel does not take"
@@ -120,7 +120,7 @@ _last = _Last()
 _KEPT = 128
 
 
-def _keep(make: Callable[[Any], Any], x: Any) -> Any:
+def _memoise_last(make: Callable[[Any], Any], x: Any) -> Any:
     """What ``make`` makes of a named tuple, unless it is among the last ones that the thread has used."""
     kept, key = _last.packed, (make, id(x))
     last = kept.pop(key, None)
@@ -133,8 +133,8 @@ def _keep(make: Callable[[Any], Any], x: Any) -> Any:
 
 
 def pack(x: Any) -> Packed:
-    """`pack_anew`, unless the named tuple is among the last ones that the thread has used."""
-    return _keep(pack_anew, x)
+    """`pack_uncached`, unless the named tuple is among the last ones that the thread has used."""
+    return _memoise_last(pack_uncached, x)
 
 
 def forget_last_packed() -> None:
@@ -143,19 +143,19 @@ def forget_last_packed() -> None:
 
 
 @cache
-def _layout(kind: type) -> tuple[list[Any], struct.Struct]:
+def _word_layout(kind: type) -> tuple[list[Any], struct.Struct]:
     """Kinds of the numbers and arrays of a type of named tuple, and how its words are stored."""
-    _, kinds, words = _flat(example_of(kind))
+    _, kinds, words = _flatten_tuple(example_of(kind))
     return kinds, struct.Struct("=" + "".join("d" if type(x) is float else "q" for x in words))
 
 
 def example_of(kind: type) -> Any:
     """The example of a type of named tuple."""
-    return next(x for x in (*examples(), *_examples_of_large()) if isinstance(x, kind))
+    return next(x for x in (*example_tuples(), *_examples_of_large()) if isinstance(x, kind))
 
 
 @cache
-def examples() -> tuple[
+def example_tuples() -> tuple[
     Problem,
     Workspace,
     IntegratorState,
@@ -189,17 +189,17 @@ def examples() -> tuple[
     state = integrator(np.zeros(6), 0.0, rtol=0.0, atol=np.ones(6))
     segment = Segment(0.0, False, 0, none, np.zeros((0, 6)), none)
     nowhere = np.zeros((0, 6))
-    watching = monitor(one, nowhere, nowhere, 6, 3)
+    watching = new_monitor(one, nowhere, nowhere, 6, 3)
     work = kernel_workspace(1, 0)
-    vehicles = fleet.quadrotors([fleet.VehicleDynamics(1.0, point=True)])
+    vehicles = fleet.quadrotor_arrays([fleet.VehicleDynamics(1.0, point=True)])
     flight = fleet.ideal_flight(vehicles, start=0.0, h=0.0, steps=1)
     S = np.zeros((1, fleet.STATES))
     rows = np.zeros((0, 1, 3))
     return (
         problem, work, state, segment, UNRECORDED, watching, flight, fleet.initial_state(flight, S, work),
-        fleet.segment(1, 0, 0.0),
+        fleet.sampled_segment(1, 0, 0.0),
         avoidance_arrays(period=1.0, b=one, lift=one, mass=one, g=0.0, radius=one),
-        measurement_of(1, 0, 0, time=none, start=np.zeros(1, dtype=np.int64), attached=np.zeros(0, dtype=np.bool_),
+        measurement_arrays(1, 0, 0, time=none, start=np.zeros(1, dtype=np.int64), attached=np.zeros(0, dtype=np.bool_),
                  framed=False, mass=one, lost_at=one, limit=one, edges=np.zeros((0, 2), dtype=np.int64),
                  r=rows, v=rows, f_u=rows, f_C=rows, p=rows, T_ref=np.zeros((0, 3, 3))),
         Recursion(np.zeros((0, 1)), none, False), one_solid(half_space(0.0)),

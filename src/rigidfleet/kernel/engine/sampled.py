@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rigidfleet.kernel.avoidance import AvoidanceArrays
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.engine.packing import UNRECORDED, Packed, pack, pack_anew
+from rigidfleet.kernel.engine.packing import UNRECORDED, Packed, pack, pack_uncached
 from rigidfleet.kernel.fleet import ENDLESS, SampledFlight, SampledSegment, SampledState
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.kernel.records import Segment
@@ -30,7 +30,7 @@ def fly_ticks(
         raise ValueError(
             "a sampled flight takes a problem in the inertial formulation without disturbances; its Flight has its own"
         )
-    law = pack_anew(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
+    law = pack_uncached(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
     call = segment._replace(
         recorder=native.recorder_address(), segment=law.address, record=pack(UNRECORDED).address
     )
@@ -38,7 +38,7 @@ def fly_ticks(
         own = _pack_avoidance(avoidance, problem, workspace)
         guard = native.library("avoidance").addresses["avoid"]
         call = call._replace(guard=guard, avoidance=own.address)
-    arguments = *map(pack, (problem, workspace, flight, state)), pack_anew(call)
+    arguments = *map(pack, (problem, workspace, flight, state)), pack_uncached(call)
     return native.library("sampled").fly_ticks(*(x.address for x in arguments))
 
 

@@ -137,19 +137,19 @@ class Trace:
         self.coordinates = 3 * n
         if any(self.outputs[q] is not y[3 * n + q] for q in range(3 * n)):
             raise UnfitError("a derivative of a position that is not the velocity")
-        self.gauge: list[Any] = self._gauge(p, w, order)
+        self.gauge: list[Any] = self._gauged_forces(p, w, order)
 
     def _with_symbols(self, problem: Problem) -> Problem:
         """The problem with symbols in place of its numbers."""
         _, self._values, which = structure(problem)
         self._numbers = iter(which.tolist())
-        p = _parts_in_use(problem)
-        p = p._replace(**{name: self._symbolic(getattr(p, name)) for name in _PARTS})
+        p = _drop_unused_parts(problem)
+        p = p._replace(**{name: self._symbols_of(getattr(p, name)) for name in _PARTS})
         before = [self.symbol("before", k) for k in range(len(problem.graph.edges))]
         return p._replace(reference=p.reference._replace(d0=np.array(before, dtype=object)))
 
-    def _gauge(self, p: Problem, w: Any, order: Ints) -> list[Any]:
-        """Forces to watch, see `gauge.read_gauge`: none."""
+    def _gauged_forces(self, p: Problem, w: Any, order: Ints) -> list[Any]:
+        """Forces to watch, see `gauge.write_force_gauge`: none."""
         return []
 
     def known_positive(self, x: Symbol) -> bool:
@@ -240,12 +240,12 @@ class Trace:
         twice = s + s
         return a, b, twice * self._series(xx, 2, 1), twice * self._series(xx, 3, 1)
 
-    def _symbolic(self, x: Any) -> Any:
+    def _symbols_of(self, x: Any) -> Any:
         """Replace numbers by symbols, equal numbers by the same one; 0 and 1 stay numbers."""
         if isinstance(x, tuple):
-            return type(x)(*map(self._symbolic, x))
+            return type(x)(*map(self._symbols_of, x))
         if isinstance(x, np.ndarray):
-            plain = [self._symbolic(value) for value in x.ravel().tolist()]
+            plain = [self._symbols_of(value) for value in x.ravel().tolist()]
             return np.array(plain, dtype=object).reshape(x.shape)
         if not isinstance(x, float):
             return x
@@ -275,16 +275,16 @@ class Trace:
         }
         worlds: dict[int, dict[str, Any]] = {}
 
-        def rebuilt(function: Dispatcher) -> FunctionType:
+        def rebuild(function: Dispatcher) -> FunctionType:
             source = function.py_func.__globals__
             if id(source) not in worlds:
                 world = worlds[id(source)] = dict(source)
                 calls = {k: v for k, v in source.items() if isinstance(v, Dispatcher)}
-                world.update({k: rebuilt(v) for k, v in calls.items()})
+                world.update({k: rebuild(v) for k, v in calls.items()})
                 world.update(instead)
             return FunctionType(function.py_func.__code__, worlds[id(source)])
 
-        return rebuilt(function)
+        return rebuild(function)
 
 
 #: Numbers in which the problems of eight flights may differ, and arrays of numbers. Those of the last lines are left
@@ -341,33 +341,33 @@ class FlightTrace(Trace):
 
     def _with_symbols(self, problem: Problem) -> Problem:
         parts: dict[str, dict[str, Any]] = {}
-        there = _is_nonzero(problem, self._values)
+        there = _nonzero_by_name(problem, self._values)
         for name, index, x in _number_places(problem):
             zero = not there.get(name, True)
             made = [0.0 if zero else self.symbol("uniform", index + k) for k in range(np.size(x))]
             part, field = name.split(".")
             array = np.array(made, dtype=object).reshape(np.shape(x))
             parts.setdefault(part, {})[field] = array if np.ndim(x) else array.item()
-        motion = self._table(MOTION, (1, 6, 6))
+        motion = self._table_symbols(MOTION, (1, 6, 6))
         motion[:, [not moving for moving in self._moves]] = 0.0
         parts["motion"]["coefficients"] = motion
         for name, which in (("gust", GUSTS), ("noise_r", NOISE_R), ("noise_v", NOISE_V)):
             rows, *shape = getattr(problem.disturbance, name).shape
-            parts["disturbance"][name] = self._table(which, (4 if rows else 0, *shape))
+            parts["disturbance"][name] = self._table_symbols(which, (4 if rows else 0, *shape))
         parts["disturbance"] |= {"gust_step": GUST, "noise_step": NOISE}
         return problem._replace(
             **{part: getattr(problem, part)._replace(**fields) for part, fields in parts.items()}
         )
 
-    def _table(self, which: int, shape: tuple[int, ...]) -> Any:
+    def _table_symbols(self, which: int, shape: tuple[int, ...]) -> Any:
         """Rows of a table at the moment."""
         made = [self.symbol("table", which, k) for k in range(math.prod(shape))]
         return np.array(made, dtype=object).reshape(shape)
 
-    def _gauge(self, p: Problem, w: Any, order: Ints) -> list[Any]:
+    def _gauged_forces(self, p: Problem, w: Any, order: Ints) -> list[Any]:
         n, m = len(p.vehicles.m), len(order)
         values = np.full(5 * n + 2 * m, 0.0, dtype=object)
-        self._as_plain_python(gauge.read_gauge)(p, w, values)
+        self._as_plain_python(gauge.write_force_gauge)(p, w, values)
         places = np.arange(len(values))
         places[3 * n : 3 * n + 2 * m] = np.concatenate([3 * n + order, 3 * n + m + order])
         return values[np.argsort(places)].tolist()
@@ -382,7 +382,7 @@ def _number_places(problem: Problem) -> Iterator[tuple[str, int, Any]]:
         index += np.size(x)
 
 
-def _is_nonzero(problem: Problem, values: Floats) -> dict[str, bool]:
+def _nonzero_by_name(problem: Problem, values: Floats) -> dict[str, bool]:
     """Whether numbers that may be zero are not zero in all of eight problems."""
     return {
         name: bool(values[index : index + np.size(x)].any())
@@ -403,7 +403,7 @@ def flight_structure(problem: Problem, values: Floats, moves: Sequence[bool]) ->
     damps = values[_NUMBERS.index("law.k_def")].astype(bool)
     if damps.any() and not damps.all():
         raise UnfitError("problems that take different branches")
-    there = [*_is_nonzero(problem, values).values(), *moves]
+    there = [*_nonzero_by_name(problem, values).values(), *moves]
     kinds = law.solver, law.iterations, problem.reference.kind, problem.control.kind
     tables = [len(x) > 0 for x in (disturbance.gust, disturbance.noise_r, disturbance.noise_v)]
     pairs = graph.edges.tobytes(), graph.pairs.tobytes()
@@ -435,8 +435,8 @@ class Code:
         self.gauge = trace.gauge
         self.positive = [x for x in trace.positive if x.known > UNIFORM]
         self._seen: set[int] = set()
-        needed = self._collect([*self.positive, *self.outputs])
-        last = self._collect(self.gauge)
+        needed = self._collect_new_symbols([*self.positive, *self.outputs])
+        last = self._collect_new_symbols(self.gauge)
         self.before = [x for x in needed + last if x.known == UNIFORM]
         self.moment = _operations_in_order(x for x in needed + last if UNIFORM < x.known < STATE)
         self.lines = _operations_in_order(x for x in needed if x.known == STATE)
@@ -447,7 +447,7 @@ class Code:
         used = of_state + [x for line in self.moment for x in line.arguments]
         self.inputs = _distinct_symbols(used, range(UNIFORM, FLIGHT))
 
-    def _collect(self, wanted: Sequence[Any]) -> list[Symbol]:
+    def _collect_new_symbols(self, wanted: Sequence[Any]) -> list[Symbol]:
         """Everything new that symbols need, each after its arguments; without recursion, because chains are long."""
         symbols, stack = [], list(wanted[::-1])
         while stack:
@@ -484,7 +484,7 @@ def structure(problem: Problem) -> tuple[bytes, Floats, Ints]:
     """
     numbers: list[Floats] = []
     others: list[Any] = [problem.has_frame, problem.body_formulation, problem.external]
-    used = _parts_in_use(problem)
+    used = _drop_unused_parts(problem)
     for name in _PARTS:
         _separate_numbers(getattr(used, name), numbers, others)
     # By a dictionary: for some hundred numbers, sorting arrays takes several times as long.
@@ -521,7 +521,7 @@ def _reorder(graph: Graph, order: Ints) -> Graph:
 _PARTS = ("vehicles", "graph", "law", "reference", "control", "disturbance")
 
 
-def _parts_in_use(problem: Problem) -> Problem:
+def _drop_unused_parts(problem: Problem) -> Problem:
     """The problem without the parts that such flights do not use, which the tracer could not handle."""
     none: Any = None
     slots = ("t0", "T_b", "d0", "p0", "dp", "turn", "knots", "ways")

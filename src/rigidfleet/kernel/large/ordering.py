@@ -18,7 +18,7 @@ def prepare_order(steps: Ints, edges: NDArray[np.integer]) -> Order:
     return Order(narrow(agent), narrow(edge), narrow(other), np.where(first, 1, -1).astype(np.int8))
 
 
-def fill_pattern(n: int, edges: NDArray[np.integer], order: Ints, most: float) -> Pattern:
+def symbolic_factorisation(n: int, edges: NDArray[np.integer], order: Ints, most: float) -> Pattern:
     """Pattern of L with agents eliminated in ``prepare_order`` (N,).
 
     If there are more than ``most`` blocks per agent, fill is omitted: the pattern is that of K.

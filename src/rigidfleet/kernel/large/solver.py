@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet.kernel.engine.native import call_large
-from rigidfleet.kernel.large.ordering import fill_pattern
+from rigidfleet.kernel.large.ordering import symbolic_factorisation
 from rigidfleet.kernel.problem import ITERATED, ConstraintLaw, Vehicles, Workspace, workspace
 from rigidfleet.kernel.records import LOST_PIVOT, Order, Pattern
 from rigidfleet.typing import Edges, Floats, Ints
@@ -90,7 +90,7 @@ class LargeSolver:
         # Not needed as long as elimination succeeds
         self.pattern: Pattern | None = None
         self.pulled = True  # whether the workspace has the multipliers of the last evaluation
-        self._calls = [_callable(method) for method in (self._solve, self._find_multipliers)]
+        self._calls = [_c_callback(method) for method in (self._solve, self._find_multipliers)]
         self.address, self.multipliers = (
             int(ctypes.cast(call, ctypes.c_void_p).value or 0) for call in self._calls
         )
@@ -106,16 +106,16 @@ class LargeSolver:
                 return
         except BaseException as error:
             self.error = error
-        self._fail()
+        self._fill_results_with_nan()
 
     def _find_multipliers(self) -> None:
         try:
             self.find_multipliers()
         except BaseException as error:
             self.error = error
-            self._fail()
+            self._fill_results_with_nan()
 
-    def _fail(self) -> None:
+    def _fill_results_with_nan(self) -> None:
         self.workspace.multiplier[:] = self.workspace.f_C[:] = math.nan
         self.pulled = True
 
@@ -126,7 +126,7 @@ class LargeSolver:
         own = workspace(len(self.a), len(self.edges), with_h=with_h, large=True)
         return replace(self, workspace=own, counts=Counts(), error=None)
 
-    def check(self) -> None:
+    def raise_pending_error(self) -> None:
         """Raise an error that occurred in a call from the kernel."""
         error, self.error = self.error, None
         if error is not None:
@@ -146,7 +146,7 @@ class LargeSolver:
             self.counts.fallbacks += 1
         if not np.isfinite(w.b).all() or not self._solve_at_agents():
             self.counts.failures += 1
-            self._fail()
+            self._fill_results_with_nan()
         elif order is not None:
             w.f_C[:] = 0.0
             call_large("apply_Jt", w.u, self.edges, w.multiplier, 1.0, w.f_C)
@@ -167,9 +167,9 @@ class LargeSolver:
         """
         w, edges, m = self.workspace, self.edges, self.vehicles.m
         if self.pattern is None:
-            self._prepare()
+            self._prepare_factor()
         # The rotation of the formation since the factor was made.
-        self.now = _axes(self.workspace.r[self.marks])
+        self.now = _axes_of_triangle(self.workspace.r[self.marks])
         self.turned = np.eye(3) if self.axes is None else self.now.T @ self.axes
         self.rest[:] = w.b
         y, a = w.multiplier, self.a
@@ -195,9 +195,9 @@ class LargeSolver:
             call_large("apply_J", w.u, edges, x, self.mbar, y)
         return True
 
-    def _prepare(self) -> None:
+    def _prepare_factor(self) -> None:
         n, edges = len(self.a), self.edges
-        self.pattern = fill_pattern(n, edges, self.setup.order(), _FILL)
+        self.pattern = symbolic_factorisation(n, edges, self.setup.order(), _FILL)
         self.L, self.place = np.zeros((len(self.pattern.row), 9)), np.empty(n, dtype=np.int64)
         # Seven digits are enough for preconditioning, unless the damping of the rigid motions is tiny.
         self.kept = self.L.astype(np.float32) if self.mu > _EXACT_MU else self.L
@@ -205,7 +205,7 @@ class LargeSolver:
         self.past, self.taken = np.zeros((systems, _PAST, n, 3)), np.zeros(systems, dtype=int)
         self.x, self.g, self.work = np.zeros((n, 3)), np.zeros((n, 3)), np.empty((5, n, 3))
         self.gram = np.empty((_PAST, _PAST + 2))
-        self.marks = _far_apart(self.workspace.r)
+        self.marks = _three_far_agents(self.workspace.r)
         # Cost of a factor in iterations.
         count = np.diff(self.pattern.column).astype(float)
         self.worth = 0.75 * float((count**2).sum() / count.sum())
@@ -276,7 +276,7 @@ class LargeSolver:
             mu = max(10.0 * mu, 1e-3)
 
 
-def _callable(method: Callable[[], None]) -> Any:
+def _c_callback(method: Callable[[], None]) -> Any:
     """A C function that calls a method. It does not keep the object alive, so that nothing but its users does."""
     reference = weakref.WeakMethod(method)
 
@@ -288,7 +288,7 @@ def _callable(method: Callable[[], None]) -> Any:
     return ctypes.CFUNCTYPE(None)(call)
 
 
-def _far_apart(r: Floats) -> Ints:
+def _three_far_agents(r: Floats) -> Ints:
     """Three agents (3,) far from each other and from a common line; they show how the formation has rotated."""
     i = int(((r - r.mean(axis=0)) ** 2).sum(axis=1).argmax())
     j = int(((r - r[i]) ** 2).sum(axis=1).argmax())
@@ -296,7 +296,7 @@ def _far_apart(r: Floats) -> Ints:
     return np.array([i, j, k])
 
 
-def _axes(r: Floats) -> Floats:
+def _axes_of_triangle(r: Floats) -> Floats:
     """Rows of a rotation (3, 3) attached to three points r (3, 3); the identity if they are on a line."""
     x = r[1] - r[0]
     z = np.cross(x, r[2] - r[0])

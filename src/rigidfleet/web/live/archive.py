@@ -32,7 +32,7 @@ class Archive:
         self.ends: dict[tuple[int, int], Piece] = {}
         self.size = 0
 
-    def add(self, pieces: Sequence[Piece]) -> None:
+    def add_tick(self, pieces: Sequence[Piece]) -> None:
         """Store the samples of a tick."""
         for piece in pieces:
             key = piece.phase, len(piece.edges)
@@ -41,17 +41,17 @@ class Archive:
             self.ends[key] = select_rows(piece, [-1])
             if keep.any():
                 kept.append(select_rows(piece, keep))
-                self.size += _size(kept[-1])
+                self.size += _count_values(kept[-1])
             if len(kept) >= _JOINED and len(kept[-1].time) < _JOINED:
-                kept[:] = [_join(kept)]
+                kept[:] = [_join_pieces(kept)]
         while self.size > self.most:
-            self._thin()
+            self._drop_every_second()
 
     def pieces(self) -> list[Piece]:
         """All stored samples, in order of time and without duplicates."""
         pieces = []
         for key, kept in self.phases.items():
-            every = _join([*kept, self.ends[key]])
+            every = _join_pieces([*kept, self.ends[key]])
             pieces.append(select_rows(every, np.unique(every.time, return_index=True)[1].tolist()))
         return pieces
 
@@ -64,34 +64,34 @@ class Archive:
         away = time / self.step
         return np.abs(away - np.round(away)) * self.step < 1e-6
 
-    def _thin(self) -> None:
+    def _drop_every_second(self) -> None:
         """Double the step: drop every second sample."""
         self.step *= 2.0
         for kept in self.phases.values():
-            whole = _join(kept)
+            whole = _join_pieces(kept)
             keep = self._is_multiple(whole.time)
             keep[0] = True  # the start
             kept[:] = [select_rows(whole, keep)]
-        self.size = sum(_size(kept[0]) for kept in self.phases.values())
+        self.size = sum(_count_values(kept[0]) for kept in self.phases.values())
         self.most = max(self.most, 2.0 * self.size if self.size > 0.5 * self.most else 0.0)
 
 
-def _size(piece: Piece) -> int:
+def _count_values(piece: Piece) -> int:
     """Number of values in the record of a piece."""
     return sum(x.size for x in piece.record)
 
 
 def select_rows(piece: Piece, which: Bools | list[int]) -> Piece:
     """Some samples of a piece."""
-    return _combine([piece], lambda x: x[0][which])
+    return _combine_arrays([piece], lambda x: x[0][which])
 
 
-def _join(pieces: list[Piece]) -> Piece:
+def _join_pieces(pieces: list[Piece]) -> Piece:
     """Pieces of one phase as one."""
-    return _combine(pieces, np.concatenate)
+    return _combine_arrays(pieces, np.concatenate)
 
 
-def _combine(pieces: Sequence[Piece], array: Callable[[Sequence[Any]], Any]) -> Piece:
+def _combine_arrays(pieces: Sequence[Piece], array: Callable[[Sequence[Any]], Any]) -> Piece:
     """A piece of which each ``array`` is made of those of pieces of one phase, also in its named tuples."""
 
     def combine(each: Sequence[Any]) -> Any:

@@ -71,15 +71,15 @@ class Ball:
 
     def predicted_sphere(self, t: float) -> obstacles.Sphere:
         """The obstacle from t [s] on, if nobody pushes it."""
-        return self._sphere([(t, self.place), (t + 1e3, self.place + 1e3 * self.velocity)])
+        return self._sphere_on_way([(t, self.place), (t + 1e3, self.place + 1e3 * self.velocity)])
 
     def flown_sphere(self, t: float) -> obstacles.Sphere:
         """The obstacle as it was up to t [s], for the record."""
         end = t if self.until is None else self.until
         ways = [*self.turns, (end, self.place)] if end > self.turns[-1][0] + 1e-6 else self.turns
-        return self._sphere(ways)
+        return self._sphere_on_way(ways)
 
-    def _sphere(self, ways: list[tuple[float, Floats]]) -> obstacles.Sphere:
+    def _sphere_on_way(self, ways: list[tuple[float, Floats]]) -> obstacles.Sphere:
         if len(ways) == 1:
             ways = [*ways, (ways[0][0] + 1.0, ways[0][1])]
         vanishing: dict[str, Any] = {} if self.until is None else {"vanishes": self.until}

@@ -231,7 +231,7 @@ class Pilot:
         """The balls that are there."""
         return [ball for ball in self.balls if ball.until is None]
 
-    def ball(self, slot: int) -> Ball:
+    def ball_at_slot(self, slot: int) -> Ball:
         """The ball that has a slot of the page.
 
         Raises
@@ -246,14 +246,14 @@ class Pilot:
 
     def pull_ball(self, slot: int, goal: Floats | None) -> None:
         """Draw a ball to a goal (3,) [m], or let go of it: it stays where it is."""
-        ball = self.ball(slot)
+        ball = self.ball_at_slot(slot)
         ball.goal = goal
         if goal is None:
             ball.set_velocity(np.zeros(3))
 
     def remove_ball(self, slot: int) -> None:
         """Remove a ball."""
-        ball = self.ball(slot)
+        ball = self.ball_at_slot(slot)
         self.moved = True
         if ball.turns:
             ball.until = self.t
@@ -296,7 +296,7 @@ class Pilot:
             now: dict[str, Any] = {"ending": "", "statistics": {}, "network": flight.network}
             self.last = assemble_result(flight.mission, phases, end, **now)
             self.last.mission = flight.mission  # with the balls, and not parsed again
-            self.archive.add(flight.pieces)
+            self.archive.add_tick(flight.pieces)
         return self.last
 
     def result(self) -> Result:

@@ -82,22 +82,22 @@ class _Handler(BaseHTTPRequestHandler):
             return False
         if self._is_from_our_page():
             return True
-        self._answer(HTTPStatus.FORBIDDEN, "open the address that the program printed")
+        self._send_answer(HTTPStatus.FORBIDDEN, "open the address that the program printed")
         return False
 
     def do_GET(self) -> None:
         """Send the page, or its stream."""
         if self.path == self.base:
-            self._answer(HTTPStatus.OK, self.session.html(), "text/html; charset=utf-8")
+            self._send_answer(HTTPStatus.OK, self.session.html(), "text/html; charset=utf-8")
         elif self.path == f"{self.base}stream":
-            self._stream()
+            self._send_stream()
         else:
-            self._answer(HTTPStatus.NOT_FOUND, "there is nothing here")
+            self._send_answer(HTTPStatus.NOT_FOUND, "there is nothing here")
 
     def do_POST(self) -> None:
         """Execute a command of a page."""
         if self.path != f"{self.base}command":
-            self._answer(HTTPStatus.NOT_FOUND, "there is nothing here")
+            self._send_answer(HTTPStatus.NOT_FOUND, "there is nothing here")
             return
         try:
             length = int(self.headers.get("Content-Length", ""))
@@ -106,13 +106,13 @@ class _Handler(BaseHTTPRequestHandler):
             command = json.loads(self.rfile.read(length))
             if not isinstance(command, dict):
                 raise ValueError("a command must be an object")
-            self.session.command(command)
+            self.session.execute_command(command)
         except RecursionError:
-            self._answer(HTTPStatus.BAD_REQUEST, "the command is nested too deeply")
+            self._send_answer(HTTPStatus.BAD_REQUEST, "the command is nested too deeply")
         except (ValueError, RigidfleetError) as error:
-            self._answer(HTTPStatus.BAD_REQUEST, str(error))
+            self._send_answer(HTTPStatus.BAD_REQUEST, str(error))
         else:
-            self._answer(HTTPStatus.NO_CONTENT, "")
+            self._send_answer(HTTPStatus.NO_CONTENT, "")
 
     def log_message(self, format: str, *args: object) -> None:
         """Log nothing: the terminal belongs to the user."""
@@ -126,7 +126,7 @@ class _Handler(BaseHTTPRequestHandler):
             return False
         return origins == [f"http://{host}"] or (not origins and self.command == "GET")
 
-    def _answer(self, status: HTTPStatus, text: str, kind: str = "text/plain") -> None:
+    def _send_answer(self, status: HTTPStatus, text: str, kind: str = "text/plain") -> None:
         data = text.encode()
         self.send_response(status)
         self.send_header("Content-Type", kind)
@@ -149,7 +149,7 @@ class _Handler(BaseHTTPRequestHandler):
             return False
         return True
 
-    def _stream(self) -> None:
+    def _send_stream(self) -> None:
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", "text/event-stream")
         self.end_headers()

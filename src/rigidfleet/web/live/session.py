@@ -22,7 +22,7 @@ from rigidfleet.web.live.balls import AT_ONCE, FASTEST, LARGEST, SMALLEST
 from rigidfleet.web.live.guarding import with_avoidance
 from rigidfleet.web.live.pilot import TICK, Pilot
 from rigidfleet.web.replay.page import page, page_text
-from rigidfleet.web.replay.scene import describe, page_samples, sight_points, vehicle_weight
+from rigidfleet.web.replay.scene import describe_scene, page_samples, sight_points, vehicle_weight
 
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 #: Full colour of an edge, as a share of a vehicle's weight.
@@ -59,9 +59,9 @@ class Session:
         self.paused, self.speed, self.pace = False, 1.0, 1.0
         self.left = math.inf  # when the last page was closed
         self.flights = 0
-        self.begin()
+        self.begin_flight()
 
-    def begin(self) -> None:
+    def begin_flight(self) -> None:
         """Begin a new flight."""
         self.pilot = Pilot(self.mission)
         self.flights += 1
@@ -73,7 +73,7 @@ class Session:
         #: Columns are those of the beginning: pages read numbers one after the other.
         widths = {name: math.prod(c.values.shape[1:]) for name, c in columns.items()}
         widths |= {"target": 7, "balls": 4 * AT_ONCE}
-        self.info: dict[str, Any] = describe(self.result, self.shown, self.tension) | {
+        self.info: dict[str, Any] = describe_scene(self.result, self.shown, self.tension) | {
             "columns": [{"name": name, "width": width} for name, width in widths.items()],
             "count": 0,
             "start": 0.0,
@@ -94,7 +94,7 @@ class Session:
             "loss": None if self.mission.network is None else self.mission.network.loss,
         }
 
-    def land(self) -> None:
+    def finish_flight(self) -> None:
         """Keep the flight, and pass it to ``landed``."""
         if self.pilot.ticks > 1:
             self.flown = self.pilot.result()
@@ -134,7 +134,7 @@ class Session:
         with self.lock:
             self.pages.add(messages)
             self.left = math.inf
-            messages.put(_event("story", json.dumps(to_json_data(self.page_state()))))
+            messages.put(_stream_event("story", json.dumps(to_json_data(self.page_state()))))
         return messages
 
     def remove_page(self, messages: queue.Queue[bytes | None]) -> None:
@@ -161,11 +161,11 @@ class Session:
         values |= {"time": self.result.time[-1:], "target": pose, "balls": balls.ravel()}
         names = ["time", *(column["name"] for column in self.info["columns"])]
         numbers = np.concatenate([values[name] for name in names]).astype("<f4")
-        return _event("sample", base64.b64encode(numbers.tobytes()).decode("ascii"))
+        return _stream_event("sample", base64.b64encode(numbers.tobytes()).decode("ascii"))
 
     # -- commands ---------------------------------------------------------------------------------
 
-    def command(self, order: Mapping[str, Any]) -> None:
+    def execute_command(self, order: Mapping[str, Any]) -> None:
         """Execute a command of a page.
 
         Raises
@@ -180,28 +180,28 @@ class Session:
                 case {"formation": str(name)} if name in self.pilot.formations:
                     self.pilot.change_formation(name)
                 case {"gust": direction, "strength": strength}:
-                    strength = _number(strength, _STRONGEST)
+                    strength = _clamped_number(strength, _STRONGEST)
                     direction = _vector(direction, 1.0)
                     if not np.linalg.norm(direction) > 0.0:  # the square of a tiny one is 0
                         raise ValueError("a gust needs a direction")
                     self.pilot.send_gust(direction, strength)
                 case {"ball": place, "radius": radius, "velocity": velocity}:
                     place, velocity = _vector(place, _FARTHEST), _vector(velocity, _FASTEST)
-                    self.pilot.add_ball(place, _number(radius, _FARTHEST), velocity)
+                    self.pilot.add_ball(place, _clamped_number(radius, _FARTHEST), velocity)
                 case {"pull": int(slot), "to": place}:
                     goal = None if place is None else _vector(place, _FARTHEST)
                     self.pilot.pull_ball(slot, goal)
                 case {"remove": int(slot)}:
                     self.pilot.remove_ball(slot)
                 case {"loss": share}:
-                    self.pilot.flight.lose(min(abs(_number(share, 0.95)), 0.95))
+                    self.pilot.flight.lose_messages(min(abs(_clamped_number(share, 0.95)), 0.95))
                 case {"pause": bool(paused)}:
                     self.paused = paused
                 case {"speed": float(speed) | int(speed)} if speed in SPEEDS:
                     self.speed = float(speed)
                 case {"again": True}:
-                    self.land()
-                    self.begin()
+                    self.finish_flight()
+                    self.begin_flight()
                 case {"stop": True}:
                     self.stop()
                 case _:
@@ -216,12 +216,12 @@ class Session:
     def run(self) -> None:
         """Fly until stopped, or until the last page has been closed for a while."""
         try:
-            self._fly()
+            self._fly_in_real_time()
         finally:
             self.stop()
             try:
                 with self.lock:
-                    self.land()
+                    self.finish_flight()
             finally:
                 self._close_pages()
 
@@ -235,7 +235,7 @@ class Session:
         while self.pages and time.monotonic() < end:
             time.sleep(0.02)
 
-    def _fly(self) -> None:
+    def _fly_in_real_time(self) -> None:
         sent: dict[str, Any] = {}
         due = measured = time.monotonic()
         flown = 0
@@ -258,16 +258,16 @@ class Session:
             news = story | {"phases": len(story["phases"])}
             if news != sent:
                 sent = news
-                self._send_to_pages(_event("story", json.dumps(to_json_data(story))))
+                self._send_to_pages(_stream_event("story", json.dumps(to_json_data(story))))
             due = max(due + TICK / self.speed, now - _LATE)
             self.stopped.wait(max(0.0, due - time.monotonic()))
 
 
-def _event(name: str, data: str) -> bytes:
+def _stream_event(name: str, data: str) -> bytes:
     return f"event: {name}\ndata: {data}\n\n".encode()
 
 
-def _number(value: Any, most: float) -> float:
+def _clamped_number(value: Any, most: float) -> float:
     # A whole number may exceed every float.
     if type(value) is not int and not (isinstance(value, float) and math.isfinite(value)):
         raise ValueError("the value must be a finite number")
@@ -277,4 +277,4 @@ def _number(value: Any, most: float) -> float:
 def _vector(value: Any, most: float) -> np.ndarray:
     if not isinstance(value, list) or len(value) != 3:
         raise ValueError("the value must be a list of three numbers")
-    return np.array([_number(x, most) for x in value])
+    return np.array([_clamped_number(x, most) for x in value])

@@ -16,22 +16,22 @@ import numpy as np
 
 from rigidfleet._common.arguments import as_path
 from rigidfleet._common.files import write_file
-from rigidfleet.math.piecewise import piece_at
+from rigidfleet.math.piecewise import piece_index
 from rigidfleet.plotting.logged import off_plan
 from rigidfleet.result import Result, as_result
 from rigidfleet.result.lights import has_lights, view_angles
 from rigidfleet.typing import Floats, Ints
-from rigidfleet.web.replay.pack import PackedColumn, pack
+from rigidfleet.web.replay.pack import PackedColumn, pack_columns
 from rigidfleet.web.replay.page import page
 from rigidfleet.web.replay.scene import (
-    describe,
+    describe_scene,
     page_samples,
     sight_points,
     typical_reach,
     vehicle_weight,
 )
 
-__all__ = ["Replay", "html_page", "replay"]
+__all__ = ["Replay", "replay", "replay_page"]
 
 _RATE = 30.0  # greatest sampling rate [Hz]; the page draws smooth curves through the samples
 #: Greatest number for all agents together; longer flights have a lower sampling rate.
@@ -88,14 +88,14 @@ def replay(result: Result | str | Path, path: str | Path | None = None) -> Repla
     TypeError
         ``result`` is neither a flight nor a path.
     """
-    page_ = html_page(as_result(result))
+    page_ = replay_page(as_result(result))
     if path is None:
         return Replay(page_)
     write_file(as_path(path), page_.encode())
     return None
 
 
-def html_page(result: Result) -> str:
+def replay_page(result: Result) -> str:
     """The page that `replay` writes."""
     time, shown = _page_times(result), _drawn_edges(result)
     most = float(np.nanmax(np.abs(result.multiplier[:, shown]), initial=0.0))
@@ -104,18 +104,18 @@ def html_page(result: Result) -> str:
     columns, swarm = page_samples(result, shown, tension), result.n_agents > _SWARM
     if swarm:  # dots have neither attitudes nor slots
         columns = {k: c for k, c in columns.items() if k not in _SHAPES}
-    described, data = pack(
+    described, data = pack_columns(
         {
             name: PackedColumn(_interpolate(result, c.values, time), c.step)
             for name, c in columns.items()
         }
     )
-    info = describe(result, shown, tension) | _story(result, time)
+    info = describe_scene(result, shown, tension) | _flight_information(result, time)
     if has_lights(result):
         azimuth, elevation = view_angles(result)
         info |= {"night": True, "azimuth": azimuth, "elevation": elevation}
     info |= {"columns": described, "count": len(time), "beyond": most > tension}
-    info |= {"note": _note(result, shown, tension, most), "swarm": swarm}
+    info |= {"note": _flight_note(result, shown, tension, most), "swarm": swarm}
     return page(info, start="replay/replay.js", data=data)
 
 
@@ -138,7 +138,7 @@ def _interpolate(result: Result, values: Floats, time: Floats) -> Floats:
     """
     if len(result.time) == 1:
         return values
-    k = piece_at(result.time, time)
+    k = piece_index(result.time, time)
     share = (time - result.time[k]) / (result.time[k + 1] - result.time[k])
     share = share.reshape(-1, *(1,) * (values.ndim - 1))
     low, high = values[k], values[k + 1]
@@ -155,7 +155,7 @@ def _drawn_edges(result: Result) -> Ints:
     return np.sort(np.argsort(typical, kind="stable")[:_EDGES])
 
 
-def _story(result: Result, time: Floats) -> dict[str, Any]:
+def _flight_information(result: Result, time: Floats) -> dict[str, Any]:
     """Information on the page about a finished flight."""
     low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
     extent, reach = float(np.linalg.norm(high - low)) / 2, typical_reach(result)
@@ -195,7 +195,7 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
     return story
 
 
-def _note(result: Result, shown: Ints, tension: float, most: float) -> str:
+def _flight_note(result: Result, shown: Ints, tension: float, most: float) -> str:
     words = []
     for name in ("separation_first", "lost_first", "clearance_first"):
         if (x := result.extreme(name)) is not None:

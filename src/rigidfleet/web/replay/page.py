@@ -31,7 +31,7 @@ def page(
     connect : hosts that the page may connect to; see `content_policy`
     """
     style = page_text("replay/page.css") + style
-    script = bundle(start)
+    script = bundle_module(start)
     template = templates("rigidfleet.web.replay", "").get_template("page.html")
     return template.render(
         policy=content_policy(style=style, script=script, connect=connect),
@@ -44,7 +44,7 @@ def page(
     )
 
 
-def bundle(start: str) -> str:
+def bundle_module(start: str) -> str:
     """One module of a JavaScript module and all that it imports: a page that is a file can import nothing.
 
     Modules import names from each other by relative paths, and share one scope here: what is declared at the top of
@@ -52,17 +52,17 @@ def bundle(start: str) -> str:
     """
     seen: set[str] = set()
 
-    def parts(name: str) -> Iterator[str]:
+    def module_texts(name: str) -> Iterator[str]:
         if name not in seen:
             seen.add(name)
             text = page_text(name)
             for target in _IMPORT.findall(text):
-                yield from parts(
+                yield from module_texts(
                     posixpath.normpath(posixpath.join(posixpath.dirname(name), target))
                 )
             yield _EXPORT.sub("", _IMPORT.sub("", text))
 
-    return "\n".join(parts(start))
+    return "\n".join(module_texts(start))
 
 
 def page_text(name: str) -> str:

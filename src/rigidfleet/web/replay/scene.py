@@ -9,13 +9,13 @@ import numpy as np
 
 from rigidfleet.math import attitude as att
 from rigidfleet.plotting import agent_colours
-from rigidfleet.plotting.areas import falls_of
+from rigidfleet.plotting.areas import fall_places_by_sample
 from rigidfleet.plotting.logged import off_plan
 from rigidfleet.plotting.quadrotors import has_rotors, rotor_forces, rotor_limits
 from rigidfleet.result import quantities
 from rigidfleet.result.lights import has_lights, lights
-from rigidfleet.solids.outline import outline
-from rigidfleet.solids.records import extent
+from rigidfleet.solids.outline import outline_of_solid
+from rigidfleet.solids.records import swept_extent
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn
 
@@ -32,7 +32,7 @@ _BESIDE = 0.15
 _FLOOR = 1e-6  # least constraint error that is distinguished from zero [m]
 
 
-def describe(result: Result, shown: Ints, tension: float) -> dict[str, Any]:
+def describe_scene(result: Result, shown: Ints, tension: float) -> dict[str, Any]:
     """Description of obstacles, fences, people, vehicles, the edges ``shown``, and plots.
 
     Full colour of an edge stands for ``tension`` [N].
@@ -50,9 +50,9 @@ def describe(result: Result, shown: Ints, tension: float) -> dict[str, Any]:
         "edges": result.edges[shown],
         "tension": tension,
         "boxes": [{"name": name, "min": ends[:3], "max": ends[3:]} for name, ends in boxes],
-        "solids": [_solid(o) for o in mission.solids if not is_plain_box(o)],
+        "solids": [_solid_surface(o) for o in mission.solids if not is_plain_box(o)],
         "fence": None if fence is None else {"min": fence.min, "max": fence.max},
-        "areas": _areas(mission),
+        "areas": _area_rings(mission),
         "ground": mission.ground if np.isfinite(mission.ground) else 0.0,
         "solid": bool(np.isfinite(mission.ground)),
         "plots": [plot for plot, _ in _plots(result)],
@@ -64,9 +64,9 @@ def is_plain_box(thing: Obstacle) -> bool:
     return thing.kind == "box" and thing.corners is not None and not thing.zone
 
 
-def _solid(thing: Obstacle) -> dict[str, Any]:
+def _solid_surface(thing: Obstacle) -> dict[str, Any]:
     """Surface of an obstacle, to 0.1 mm, and its way: corners, triangles and lines as indices, times and places."""
-    surface, solid = outline(thing.solid), thing.solid
+    surface, solid = outline_of_solid(thing.solid), thing.solid
     points = np.concatenate([surface.triangles.reshape(-1, 3), surface.lines.reshape(-1, 3)])
     corners, index = np.unique(points.round(4), axis=0, return_inverse=True)
     index, cut = index.reshape(-1), 3 * len(surface.triangles)
@@ -82,7 +82,7 @@ def _solid(thing: Obstacle) -> dict[str, Any]:
     }
 
 
-def _areas(mission: Mission) -> list[dict[str, Any]]:
+def _area_rings(mission: Mission) -> list[dict[str, Any]]:
     """Fences and places with people: their rings (m, 2) [m], and their heights [m], None where they have no end."""
     areas: list[tuple[Area, str, bool]] = [
         (x, "soft" if x.soft else "fence", x.kind == "exclusion") for x in mission.fences
@@ -94,7 +94,7 @@ def _areas(mission: Mission) -> list[dict[str, Any]]:
             "kind": kind,
             "hatched": hatched,
             "rings": area.rings(mission.geodetic_origin),
-            "heights": [x if np.isfinite(x) else None for x in area.heights(mission.ground)],
+            "heights": [x if np.isfinite(x) else None for x in area.height_span(mission.ground)],
         }
         for area, kind, hatched in areas
     ]
@@ -159,7 +159,7 @@ def _further_columns(
         oldest = np.where(np.isnan(age), np.inf, age)[:, shown].max(axis=2)
         yield "silent", PackedColumn(np.minimum(oldest / net.silence, 1.0), 0.01)
     if mission.fences or mission.people:
-        yield "fall", PackedColumn(falls_of(result), fine)
+        yield "fall", PackedColumn(fall_places_by_sample(result), fine)
     if (off := off_plan(result)) is not None:
         yield "doubt", PackedColumn(off.doubt, fine)
 
@@ -173,11 +173,11 @@ def sight_points(mission: Mission, low: Floats, high: Floats) -> Floats:
     reach = max(float(np.linalg.norm(high - low)), 1e-6)
     boxes = []
     for box in mission.solids:  # of a height map only what is drawn
-        ends = extent(box.solid)
+        ends = swept_extent(box.solid)
         if box.kind == "heights":
             ends[0, 2] = box.solid.heights.min()
         boxes.append((*ends, reach * (_BESIDE if box.solid.moves else 1.0)))
-    for area in _areas(mission):
+    for area in _area_rings(mission):
         flat, (floor, ceiling) = np.concatenate(area["rings"]), area["heights"]
         heights = low[2] if floor is None else floor, high[2] if ceiling is None else ceiling
         boxes.append((*np.column_stack([[flat.min(axis=0), flat.max(axis=0)], heights]), reach))
@@ -212,7 +212,7 @@ def vehicle_weight(mission: Mission) -> float:
     return float(np.mean(mission.agents.mass)) * max(mission.gravity, 1.0)
 
 
-def _lines(values: Floats) -> Floats:
+def _plot_lines(values: Floats) -> Floats:
     """Lines (K, L) of a plot: the values (K, N) of each vehicle, or of many the least and the greatest."""
     if values.shape[1] <= _LINES:
         return values
@@ -225,7 +225,7 @@ def _plots(result: Result) -> Iterator[tuple[dict[str, Any], PackedColumn]]:
     limits = mission.limits
     colours = agent_colours(n) if n <= _LINES else ["#8FA3B8", "#20262D"]
 
-    def plot(name: str, title: str, values: Floats, step: float, **look: Any) -> Any:
+    def plot_entry(name: str, title: str, values: Floats, step: float, **look: Any) -> Any:
         basic = {
             "column": f"{name} plot", "title": title, "unit": "m", "colours": ["#20262D"], "worst": "greatest",
             "limits": [None], "least": None, "log": False, "floor": _FLOOR, "band": False,
@@ -235,7 +235,7 @@ def _plots(result: Result) -> Iterator[tuple[dict[str, Any], PackedColumn]]:
     if has_rotors(result):
         share = 100.0 * rotor_forces(result).max(axis=2) / rotor_limits(mission)
         look: dict[str, Any] = {"unit": "%", "colours": colours, "limits": [100.0] * len(colours)}
-        yield plot("rotor", "Rotors, share of limit", _lines(share), 0.1, **look)
+        yield plot_entry("rotor", "Rotors, share of limit", _plot_lines(share), 0.1, **look)
     elif off is None and result.interpolation is None:  # else nobody knows the thrust
         title, thrust, most = "Greatest thrust", result.thrust, mission.fleet.thrust_limit
         look = {"unit": "N", "colours": colours, "limits": mission.agents.thrust_limit}
@@ -244,20 +244,20 @@ def _plots(result: Result) -> Iterator[tuple[dict[str, Any], PackedColumn]]:
             if len(set(mission.agents.thrust_limit)) > 1:
                 title, thrust = f"{title}, as share of limit", 100.0 * thrust / most
                 look |= {"unit": "%", "limits": [None, 100.0]}
-        yield plot("thrust", title, _lines(thrust), 1e-3, **look)
+        yield plot_entry("thrust", title, _plot_lines(thrust), 1e-3, **look)
     if off is not None or has_rotors(result):
         worst, limit = quantities.samples(result, "tracking_error").worst, limits.tracking_error
         if off is not None:  # beside the line, the band that it may be in
-            worst = np.stack([worst, *np.fmax.reduce(off.interval, axis=2)], axis=1)
-        yield plot("off", "Tracking error", worst, 1e-4, limits=[limit], band=off is not None)
+            worst = np.stack([worst, *np.fmax.reduce(off.distance_interval, axis=2)], axis=1)
+        yield plot_entry("off", "Tracking error", worst, 1e-4, limits=[limit], band=off is not None)
     if len(mission.edges):
         # Without active edges there is no error.
         error = np.where(np.isnan(result.constraint), -1.0, np.abs(result.constraint))
         error = error.max(axis=1, initial=-1.0)
         error = np.where(error < 0.0, np.nan, error)
-        yield plot("error", "Constraint error", error, _FLOOR, log=True)
+        yield plot_entry("error", "Constraint error", error, _FLOOR, log=True)
     least = {"worst": "least", "least": limits.separation_always}
     if n > 1:
-        yield plot("separation", "Separation", result.separation, 1e-3, **least)
+        yield plot_entry("separation", "Separation", result.separation, 1e-3, **least)
     if mission.obstacles:
-        yield plot("clearance", "Clearance", result.clearance, 1e-3, **least | {"least": 0.0})
+        yield plot_entry("clearance", "Clearance", result.clearance, 1e-3, **least | {"least": 0.0})
