@@ -54,7 +54,7 @@ def base(tmp_path, monkeypatch) -> Iterator[Path]:
     folder = tmp_path / "base"
     folder.mkdir(0o700)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder))
-    monkeypatch.setattr(native, "_compile", lambda _: [code(OWN)])
+    monkeypatch.setattr(native, "_compile_part", lambda _: [code(OWN)])
     monkeypatch.setattr(native, "_loaded", {})
     file = native._cache_file("flight")
     file.write_bytes(objects.join_objects([code(PLANTED)]))
@@ -199,7 +199,7 @@ def test_what_is_made_is_private(tmp_path, monkeypatch):
     """Folders and files of the cache are this user's alone, though whatever else they make is everybody's."""
     base = tmp_path / "a" / "b"
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(base))
-    monkeypatch.setattr(native, "_compile", lambda _: [code(OWN)])
+    monkeypatch.setattr(native, "_compile_part", lambda _: [code(OWN)])
     before = os.umask(0)
     try:
         assert answer() == OWN
@@ -377,7 +377,7 @@ def test_workers_compile_nothing_that_cannot_be_kept(base, monkeypatch):
     given = pickle.loads(pickle.dumps(native.code_to_inherit()))
     forget()
     monkeypatch.setattr(native, "_loaded", {})
-    monkeypatch.setattr(native, "_compile", refused)
+    monkeypatch.setattr(native, "_compile_part", refused)
     native.inherit_code(given)
     assert native.library().integrate(0, 0, 0, 0) == OWN
     assert jit.jit(lambda x: 3.0 * x)(1.0) == 3.0  # and do not warn again

@@ -294,7 +294,7 @@ def test_no_distance_changes_more_than_its_bound(formulation, monkeypatch):
         way = np.linalg.norm(x[-1] - x[0], axis=1).max()
         found.append((*changes, *watch.monitor.moves, way, state.trail.clock[0, 0]))
 
-    monkeypatch.setattr(watching.native.Watch, "bound_moves", spy)
+    monkeypatch.setattr(watching.native.Watch, "bound_distance_changes", spy)
     simulate(mission)
     space, above, bound, bound_above, way, t = np.array(found).T
     assert (space <= bound + 1e-9).all()
@@ -533,7 +533,7 @@ def test_what_goes_wrong_in_the_thread_that_watches_is_raised(monkeypatch):
                 raise KeyboardInterrupt
         wait(extremes)
 
-    monkeypatch.setattr(watching.Extremes, "wait", interrupt)
+    monkeypatch.setattr(watching.Extremes, "wait_for_steps", interrupt)
     with pytest.raises(FlightInterrupted) as stopped:
         simulate(mission)
     result = stopped.value.result
