@@ -494,7 +494,7 @@ def fly_with(plain: str) -> None:
         word = ctypes.c_int64
         call = ctypes.CFUNCTYPE(word, *(word,) * 4)(avoid)
         address = ctypes.cast(call, ctypes.c_void_p).value
-        library = native.Library(avoid=call, addresses={"avoid": address}, unkept=None)
+        library = native.Library(avoid=call, addresses={"avoid": address})
         native._loaded["avoidance"] = library
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import llvmlite.binding as llvm
 import pytest
 
-from rigidfleet.kernel.compiler import jit
+from rigidfleet.kernel.compiler import cache, jit
 from rigidfleet.kernel.compiler.cache import cache_directory
 from rigidfleet.kernel.engine import native, objects
 from rigidfleet.kernel.engine.native import is_compiled
@@ -45,7 +45,7 @@ def answer() -> int:
 
 def forget() -> None:
     """Let the next warning be the first."""
-    native.warned.clear()
+    cache.warned.clear()
 
 
 @pytest.fixture
@@ -367,21 +367,6 @@ def test_workers_in_a_hostile_folder(hostile, tmp_path):
     done = run(sys.executable, script, cwd=hostile)
     assert not (hostile / "mark").exists()
     assert done.stdout == "3\n", done.stderr
-
-
-def test_workers_compile_nothing_that_cannot_be_kept(base, monkeypatch):
-    """Where nothing can be kept, processes that are started get the machine code from the one that compiled it."""
-    (base / "rigidfleet").chmod(0o777)
-    with pytest.warns(RuntimeWarning):
-        assert native.library().integrate(0, 0, 0, 0) == OWN
-    given = pickle.loads(pickle.dumps(native.code_to_inherit()))
-    forget()
-    monkeypatch.setattr(native, "_loaded", {})
-    monkeypatch.setattr(native, "_compile_part", refused)
-    native.inherit_code(given)
-    assert native.library().integrate(0, 0, 0, 0) == OWN
-    assert jit.jit(lambda x: 3.0 * x)(1.0) == 3.0  # and do not warn again
-    assert native.code_to_inherit() == given
 
 
 @pytest.mark.long

@@ -16,7 +16,7 @@ import pytest
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes, console
 from rigidfleet.errors import ResultError
-from rigidfleet.kernel.compiler import jit
+from rigidfleet.kernel.compiler import cache, jit
 from rigidfleet.kernel.engine import native
 from rigidfleet.result import Result
 
@@ -181,7 +181,7 @@ def test_kill_in_the_middle_of_a_write(flown: bytes):
 
 def test_a_full_disk_while_the_kernel_is_kept():
     """A kernel that cannot be written to its cache flies all the same; a warning names the folder and the reason."""
-    native.warned.clear()
+    cache.warned.clear()
     double: Any = jit.jit(lambda x: 2.0 * x)
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (16, limit[1]))
@@ -198,13 +198,13 @@ def test_a_full_disk_while_the_kernel_is_kept():
 def test_a_full_disk_while_machine_code_is_kept(tmp_path, monkeypatch):
     """Nothing is left of machine code that could not be written, but a warning."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    native.warned.clear()
+    cache.warned.clear()
     file = native._cache_file("flight")
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (16, limit[1]))
     try:
         with pytest.warns(RuntimeWarning, match="File too large"):
-            assert not native._cache_code([b"machine code"], "flight")
+            native._cache_code([b"machine code"], "flight")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert not any(file.parent.iterdir())

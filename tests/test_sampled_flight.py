@@ -416,19 +416,6 @@ def test_points_do_not_load_the_code_of_quadrotors():
     subprocess.run([sys.executable, "-c", LIBRARIES, str(Path(__file__).parent)], check=True)
 
 
-def test_code_that_cannot_be_kept_is_given_to_child_processes(monkeypatch):
-    """Where nothing can be kept, a child process gets the second library's code, too."""
-    code = native._read_cached_code("sampled")
-    assert code is not None
-    others = {part: x for part, x in native._loaded.items() if part != "sampled"}
-    made = native._make_library("sampled", *native._link_objects(code), code)
-    monkeypatch.setattr(native, "_loaded", others | {"sampled": made})
-    given = native.code_to_inherit()
-    monkeypatch.setattr(native, "_loaded", others)
-    native.inherit_code(given)
-    assert native.library("sampled").unkept == code
-
-
 def test_a_flight_goes_on_under_another_problem():
     """Phases follow one another: ticks, histories and extremes go on; edges, integral and frame are the new ones."""
     problem, work, flight, state = planned("cube-passage", 0, SIH)

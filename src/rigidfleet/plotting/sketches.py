@@ -39,8 +39,7 @@ def sketch_places(mission: Mission, name: str) -> tuple[Floats, bool]:
     d = shortest_path(coo_array((lengths, edges.T), (n, n)), directed=False)
     # Between components that no edge joins
     d[np.isinf(d)] = 1.5 * d[np.isfinite(d)].max(initial=1.0)
-    centring = np.eye(n) - 1 / n
-    value, vector = np.linalg.eigh(-0.5 * centring @ d**2 @ centring)
+    value, vector = distance_geometry.scale_distances(d)
     places = np.zeros((n, 3))
     places[:, : min(n, 3)] = (vector * np.sqrt(np.maximum(value, 0)))[:, ::-1][:, :3]
     return places, False

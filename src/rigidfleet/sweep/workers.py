@@ -12,16 +12,13 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import connection
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rigidfleet._common.processes import keep_folder_off_path
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep.definition import sweep_of_json
 from rigidfleet.sweep.record import RunRecord
 from rigidfleet.sweep.run import fly_runs
-
-if TYPE_CHECKING:
-    from rigidfleet.kernel.engine.native import Inheritance
 
 #: Maximum time to wait for a scheduler [s].
 _CONNECT = 20.0
@@ -51,16 +48,13 @@ def start_processes(count: int) -> Generator[Executor]:
     They are forks of this process where that is safe, as they then begin with all that it has loaded. Elsewhere, each
     starts on its own.
     """
-    from rigidfleet.kernel.engine.native import code_to_inherit
-
     before = set(multiprocessing.active_children())
     forked = _has_one_thread()
     context = multiprocessing.get_context("fork" if forked else "spawn")
-    own = None if forked else code_to_inherit()
     # Before a spawned process receives the module path of its parent, it would search the current folder first, even
     # for modules of the standard library; so would multiprocessing's resource tracker.
     with keep_folder_off_path():
-        pool = ProcessPoolExecutor(count, context, _begin_worker, (own,))
+        pool = ProcessPoolExecutor(count, context, _begin_worker)
         try:
             if forked:  # all forks begin at once, and Ctrl-C waits from their start
                 before_fork = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -86,17 +80,13 @@ def _has_one_thread() -> bool:
         return False
 
 
-def _begin_worker(inheritance: Inheritance | None) -> None:
-    """Prepare a worker: ignore Ctrl-C, end with the parent process, and take compiled code that it gives."""
+def _begin_worker() -> None:
+    """Prepare a worker: ignore Ctrl-C, and end with the parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # A run makes thousands of arrays and leaves hardly any cycle: to search for them takes a twentieth of its time.
     gc.freeze()
     gc.set_threshold(100_000)
-    if inheritance is not None:
-        from rigidfleet.kernel.engine.native import inherit_code
-
-        inherit_code(inheritance)
 
 
 def _end_with_parent() -> None:

@@ -21,7 +21,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import IO
 
-#: Whether this process or its parent has warned already.
+#: Whether this process has warned already.
 warned = threading.Event()
 
 

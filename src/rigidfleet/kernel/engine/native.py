@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from rigidfleet.kernel.compiler.cache import (
     open_safely,
     sources_digest,
     warn_not_cached,
-    warned,
 )
 from rigidfleet.kernel.compiler.levels import (
     HOST,
@@ -180,7 +179,7 @@ def call_large(name: str, *arguments: Any) -> float:
 class Library(SimpleNamespace):
     """Machine code that is loaded: its functions by name (`objects.ENTRIES`), and their ``addresses``.
 
-    The ``engine`` keeps the code alive; ``unkept`` are its objects if they could not be stored in the cache.
+    The ``engine`` keeps the code alive.
     """
 
 
@@ -215,12 +214,11 @@ def _load_library(part: str) -> Library:
             stacklevel=2,
         )
     parts = _compile_part(part)
-    return _make_library(part, *_link_objects(parts), None if _cache_code(parts, part) else parts)
+    _cache_code(parts, part)
+    return _make_library(part, *_link_objects(parts))
 
 
-def _make_library(
-    part: str, engine: Any, address_of: Callable[[str], int], unkept: list[bytes] | None = None
-) -> Library:
+def _make_library(part: str, engine: Any, address_of: Callable[[str], int]) -> Library:
     """Make a library of the functions of a part, whose code the ``engine`` keeps alive."""
     word = ctypes.c_int64
     result = ctypes.c_double if part == "large" else word
@@ -229,7 +227,7 @@ def _make_library(
         name: ctypes.CFUNCTYPE(result, *(word,) * words)(addresses[name])
         for name, words in ENTRIES[part].items()
     }
-    return Library(**calls, addresses=addresses, engine=engine, unkept=unkept)
+    return Library(**calls, addresses=addresses, engine=engine)
 
 
 def _load_shared_object(file: Path) -> tuple[Any, Callable[[str], int]]:
@@ -247,27 +245,6 @@ def _link_objects(parts: Sequence[bytes]) -> tuple[Any, Callable[[str], int]]:
         engine.add_object_file(llvm.ObjectFileRef.from_data(part))
     engine.finalize_object()
     return engine, engine.get_function_address
-
-
-class Inheritance(NamedTuple):
-    """Code by part that a child process need not compile again, and whether it need not repeat a warning."""
-
-    code: dict[str, list[bytes]]
-    warned: bool
-
-
-def code_to_inherit() -> Inheritance:
-    """Code of this process that its child processes cannot find in the cache; to be sent only to them."""
-    unkept = {part: library.unkept for part, library in _loaded.items()}
-    return Inheritance({part: code for part, code in unkept.items() if code}, warned.is_set())
-
-
-def inherit_code(inheritance: Inheritance) -> None:
-    """Take over the code and warnings of the parent process."""
-    if inheritance.warned:
-        warned.set()
-    for part, code in inheritance.code.items():
-        _loaded[part] = _make_library(part, *_link_objects(code), code)
 
 
 def _compile_part(part: str) -> list[bytes]:
@@ -316,15 +293,13 @@ def _read_cached_code(part: str) -> list[bytes] | None:
         return None
 
 
-def _cache_code(parts: Sequence[bytes], part: str) -> bool:
+def _cache_code(parts: Sequence[bytes], part: str) -> None:
     """Store machine code in the cache, or warn that it will be compiled again."""
     try:
         with replace_atomically(_cache_file(part), private=True) as stream:
             stream.write(join_objects(parts))
     except OSError as error:
         warn_not_cached(error)
-        return False
-    return True
 
 
 def is_compiled() -> bool:
