@@ -799,7 +799,7 @@ def test_a_pool_that_breaks_as_it_is_given_work_loses_none(tmp_path, monkeypatch
     kinds = [Dying, ThreadPoolExecutor]
 
     monkeypatch.setattr("rigidfleet.sweep.runner.WORTH", 0.0)
-    monkeypatch.setattr("rigidfleet.sweep.workers.processes", processes)
+    monkeypatch.setattr("rigidfleet.sweep.workers.start_processes", processes)
     monkeypatch.setattr("rigidfleet.sweep.runner._CHUNK", 0.0)
     asked = sweep(runs=60)
     with caplog.at_level(logging.INFO, "rigidfleet.sweep"):

@@ -82,7 +82,8 @@ def fit_curves(
     """For each vehicle the fewest pieces that go from knot to knot within a tolerance [m], and one of yaw [rad].
 
     Pieces meet 4 (degree 7) or 2 ``orders`` of derivatives (degree 3; yaw: always) at the knots they join. Each is as
-    long as the tolerance allows, and not longer than ``longest`` [s]. ``ways`` are those of `ExportedMotion.chunks`.
+    long as the tolerance allows, and not longer than ``longest`` [s]. ``ways`` are
+    those of `ExportedMotion.curve_chunks`.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """Disturbances of a flight: wind, gusts, noise, wrong masses, lost vehicles.
 
 The control laws use measured states and assumed masses; the equations of motion use the true ones.
-Before the laws, `sense` replaces the true state by the measured one. After them, `disturb` restores the
-true state and adds the forces that no vehicle knows.
+Before the laws, `swap_in_measured_states` replaces the true state by the measured one. After them,
+`restore_states_and_disturb` restores the true state and adds the forces that no vehicle knows.
 """
 
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- compiles `height_below`
@@ -16,7 +16,7 @@ _CONTACT, _SOFT = 20.0, 0.01
 
 @jit_inline
 def spline_weights(t, step, rows):
-    """First of the four rows of a table of ``rows`` that count at t, and their weights; see `spline`."""
+    """First of the four rows of a table of ``rows`` that count at t, and their weights; see `spline_value`."""
     last = rows - 4
     x = min(max(t / step, 0.0), last + 1.0)
     j = min(int(x), last)

@@ -157,9 +157,9 @@ class Air(NamedTuple):
 
     wind: Floats  # (3,) steady, world [m/s]
     gust_step: float  # between knots [s]
-    gust: Floats  # (K, N, 3) coefficients of cubic B-splines over time [m/s]; see `disturbances.spline`
+    gust: Floats  # (K, N, 3) coefficients of cubic B-splines over time [m/s]; see `disturbances.spline_value`
     downwash: bool  # see `aerodynamics.add_downwash`
-    ground_effect: bool  # see `aerodynamics.ground_effect`
+    ground_effect: bool  # see `aerodynamics.ground_effect_factor`
     density: float  # [kg/m^3]
     ground: float  # height of the ground [m]
     floor: Floats  # (N,) height at which a lost vehicle comes to rest on it [m]

@@ -97,8 +97,8 @@ def rotation_series(phi: Floats, orders: int | None = None) -> Floats:
 def rotation_vector_series(R: Floats) -> Floats:
     """Series (n, ..., 3) of rotation vectors phi [rad], R = Exp(phi), of rotations (n, ..., 3, 3); |phi| < pi.
 
-    The inverse of `rotation`, order by order: coefficient k of R contains that of phi as R [J_r(phi) phi_k x], and
-    otherwise coefficients below k.
+    The inverse of `rotation_series`, order by order: coefficient k of R contains that of phi as R [J_r(phi) phi_k x],
+    and otherwise coefficients below k.
     """
     phi = np.zeros(R.shape[:-1])
     phi[0] = att.rotation_vector_from_dcm(np.swapaxes(R[0], -1, -2))

@@ -100,7 +100,7 @@ class Step(NamedTuple):
     Attributes
     ----------
     name : what it is called
-    make : makes its `way`: so many ways of so many vehicles are not kept
+    make : makes its `way_text`: so many ways of so many vehicles are not kept
     duration : how long it takes [s]
     end : positions (N, 3) [m] at its end
     least : separation that is proved, its time from the beginning
@@ -304,7 +304,7 @@ class Aborts:
 
     @cached_property
     def wrecks(self) -> list[Sphere]:
-        """The lost vehicles, wider by `astray`, which fall from where they were by the plan, and then lie."""
+        """The lost vehicles, wider by `fall_uncertainty`, which fall from where they were by the plan, and then lie."""
         air, lost_at, wrecks = self.fall_model, self.mission.lost_at, []
         for i in self.wrecked.tolist():
             states = self.plan.states(lost_at[[i]], 2)
@@ -388,7 +388,7 @@ class Aborts:
     def _least_time_along(
         self, first: float, limits: list[Limit], clock: Callable[[float], Piecewise]
     ) -> tuple[float, Floats]:
-        """`least_time` of a step along the plan by a clock of a time; where the plan exceeds a limit, that counts."""
+        """`shortest_time` of a step along the plan by a clock of a time; where the plan exceeds a limit, it counts."""
         share = np.linspace(0.0, 1.0, _LOOKS)
 
         def excess(time: float) -> Floats:

@@ -113,7 +113,7 @@ def vehicle_lags(mission: Mission) -> list[Lag]:
 
 
 def lag_times(mission: Mission) -> Floats:
-    """Times T (N,) [s] by which each vehicle leaves its reference at most (`math.margins.overshoot`); 0 for points.
+    """Times T (N,) [s] by which each vehicle leaves its reference at most (`margins.overshoot_time`); 0 for points.
 
     Its acceleration differs by up to T times the reference's greatest jerk, its velocity by up to T times the greatest
     acceleration.

@@ -37,7 +37,7 @@ def formation_graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) ->
 
 
 def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: Path) -> None:
-    """Write `graphs` to a file, completely or not at all.
+    """Write `formation_graphs` to a file, completely or not at all.
 
     Raises
     ------

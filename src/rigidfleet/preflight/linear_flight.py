@@ -131,7 +131,7 @@ class LinearFlight:
         return SimpleNamespace(**{name: y.reshape(*shape, x.shape[1]) for (name, shape), y in cut})
 
     def _extrapolate(self, heard: Floats, t: float) -> Floats:
-        """Bring forward what was heard (W, L, B) in place by t [s], as `neighbours.extrapolate` does."""
+        """Bring forward what was heard (W, L, B) in place by t [s], as `neighbours.extrapolate_neighbour` does."""
         place, velocity, acceleration, v, a, put = heard[:_REST]
         place += t * (velocity + 0.5 * t * acceleration)
         velocity += t * acceleration

@@ -153,7 +153,7 @@ def _broken_limits(
             broken["collision"] = f"{least[2]} come {nearer:.2f} m nearer than the plan proves"
     arrival = min(int(np.searchsorted(planned.time, leg.arrival)), len(r) - 1)
     held = [("tracking error", "", float(far.max()), limits.tracking_error)]
-    # As `PhasePlan.target` and `PhasePlan.stay_target` promise.
+    # As `PhasePlan.target_record` and `PhasePlan.stay_target` promise.
     stays, later = "position" not in phase.meets, arrival < len(r) - 1
     places = [("waypoint", arrival)] * (not stays)
     places += [("its place at the end", -1)] * (stays or (later and not phase.free))

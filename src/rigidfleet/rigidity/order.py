@@ -74,7 +74,7 @@ class StressEnergy:
         return self.adjoint_stress(np.outer(q, q))
 
     def second_order_residual_rate(self, q: Floats) -> Floats:
-        """Derivative (m, k) of `residual`."""
+        """Derivative (m, k) of `second_order_residual`."""
         step = self._F[:, self._i] - self._F[:, self._j]
         rate = 2 * np.einsum("qm,qmk->mk", step @ q, step) / self._length[:, None]
         return rate - self.frame.span @ (self.frame.span.T @ rate)

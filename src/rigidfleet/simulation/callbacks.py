@@ -160,7 +160,7 @@ class ExternalForce:
     """A user's force as a C function that the kernel can call.
 
     An exception cannot pass through compiled code. It is stored, the force becomes NaN, the step is
-    rejected, and `check` raises it once the kernel has returned.
+    rejected, and `raise_user_error` raises it once the kernel has returned.
     """
 
     _SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_double, *(ctypes.c_void_p,) * 3, ctypes.c_ssize_t)

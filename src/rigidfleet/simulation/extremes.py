@@ -413,7 +413,7 @@ class Extremes(CurveWatch):
     def hand_over(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Let another thread evaluate the steps in the trail, `take_steps`; no more than `free_steps` may follow.
 
-        Until `wait`, only that thread may use this monitor, ``work``, and what the problem's law changes.
+        Until `wait_for_steps`, only that thread may use this monitor, ``work``, and what the problem's law changes.
         """
         taken, count = state._replace(count=state.count.copy()), state.count
         # The last step stays, until its neighbour is known.

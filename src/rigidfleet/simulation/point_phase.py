@@ -127,7 +127,7 @@ class PointPhase(ActivePhase):
         return Stretch(problem, times, samples, fresh, math.nextafter(self.t, math.inf))
 
     def record_stretch(self, stretch: Stretch) -> None:
-        """Store the samples of what was integrated since `prepare`."""
+        """Store the samples of what was integrated since `prepare_stretch`."""
         state, (problem, times, samples, _, first) = self.state, stretch
         done = int(state.count[records.SAMPLES])
         tried = state.count[records.EVALUATIONS] > 0 and state.count[records.ACCEPTED] == 0

@@ -65,7 +65,7 @@ class Region(NamedTuple):
         return -now, -corner_distance(-bound, np.maximum(low - greatest, least - high))
 
     def _depth(self, points: Floats, c: Floats, *, outside: bool) -> tuple[Floats, Floats]:
-        """`depth` as seen from above, of control points (M, 2, P) with middles (M, 2)."""
+        """`depths_of_curves` as seen from above, of control points (M, 2, P) with middles (M, 2)."""
         off = self._edge_to_points(c)
         apart = np.linalg.norm(off, axis=2)
         now = self._distance(off, c) * (1.0 if outside else -1.0)

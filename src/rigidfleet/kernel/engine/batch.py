@@ -332,7 +332,7 @@ def fly_all(
 def _fly_in_threads(
     begin: Callable[[], Callable[..., None]], starts: Floats, before: Floats, threads: int
 ) -> FinalStates:
-    """Distribute flights, or vectors of them, over threads; each thread calls `begin` for its own data."""
+    """Distribute flights, or vectors of them, over threads; each thread calls `make_worker` for its own data."""
     count = len(starts)
     threads = min(threads, count)
     ends = np.empty_like(starts)

@@ -249,7 +249,9 @@ def _compile(code: Code, name: str) -> int:
         kinds = y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted
         return types.void(*kinds), generate
 
-    return compiled_for_c(_derivative, f"derivative_{name}", arguments=_ARGUMENTS, _lines=lines)
+    return compiled_for_c(
+        _derivative, f"derivative_{name}", arguments=_ARGUMENTS, _code_lines=lines
+    )
 
 
 def _flight_constants(numbers, uniform):
@@ -278,7 +280,9 @@ def _compile_flight_constants(code: Code, name: str) -> Callable[[int, int], Non
 
         return types.void(source, uniform), generate
 
-    address = compiled_for_c(_before, f"before_{name}", arguments=2, _numbers_before=numbers_before)
+    address = compiled_for_c(
+        _before, f"before_{name}", arguments=2, _flight_constants=numbers_before
+    )
     return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address)
 
 

@@ -155,12 +155,12 @@ def _call_packed(function: Any, *arguments: Packed) -> int:
 
 
 def measure_samples(measured: Measured) -> None:
-    """Measure the samples of a flight, see `rigidfleet.kernel.measurement.measure`."""
+    """Measure the samples of a flight, see `rigidfleet.kernel.measurement.measure_samples`."""
     _call_packed(library().measure, pack_uncached(measured))
 
 
 def run_linear_recursion(x: Floats, a: Floats, *, backward: bool = False) -> None:
-    """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward, see `rigidfleet.kernel.recursion.recurse`."""
+    """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward; see `kernel.recursion.run_linear_recursion`."""
     _call_packed(library().follow, pack_uncached(Recursion(x, a, backward)))
 
 

@@ -114,7 +114,7 @@ def join_objects(parts: Sequence[bytes]) -> bytes:
 
 
 def split_objects(data: bytes) -> list[bytes] | None:
-    """Objects that were `concatenate`; None if they are not whole."""
+    """Objects that were `join_objects`; None if they are not whole."""
     code, digest = data[:-32], data[-32:]
     if not code or hashlib.sha256(code).digest() != digest:
         return None

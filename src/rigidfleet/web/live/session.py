@@ -41,7 +41,7 @@ _WAITING = 64  # greatest number of messages queued for a slow page; further one
 class Session:
     """One flight by hand, and the pages that show it.
 
-    `run` flies in real time while a page is open, until `stop`; other threads call `command`, `add_page`
+    `run` flies in real time while a page is open, until `stop`; other threads call `execute_command`, `add_page`
     and `remove_page`. Each flight that a page has shown is passed to ``landed`` when it ends, which returns the
     text that the pages then show.
     """

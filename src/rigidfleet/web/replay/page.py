@@ -25,7 +25,7 @@ def page(
     Parameters
     ----------
     info : plain data and arrays; see ``describe`` and recording.js
-    start : module that starts the player, see `bundle`
+    start : module that starts the player, see `bundle_module`
     data : packed samples, as ``start`` reads them
     style : CSS in addition to that of every page
     connect : hosts that the page may connect to; see `content_policy`
