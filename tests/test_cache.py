@@ -355,7 +355,7 @@ def test_a_build_process_heeds_its_parents_flags():
 WORKER = """
 from rigidfleet.sweep import workers
 if __name__ == "__main__":
-    with workers.processes(1) as pool:
+    with workers.start_processes(1) as pool:
         print(pool.submit(abs, -3).result())
 """
 

@@ -51,7 +51,7 @@ def curves(n, spread=6.0):
 
 def signed(region, points):
     """Signed distances of points (M, 3), which are curves of one control point."""
-    return region.depth(points[:, :, None], outside=True)[0]
+    return region.depths_of_curves(points[:, :, None], outside=True)[0]
 
 
 def along(points, t):

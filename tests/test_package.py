@@ -149,7 +149,7 @@ def test_nothing_that_others_made_is_executed():
             run += [ast.unparse(node)] if node.func.id in {"eval", "exec", "compile"} else []
         if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
             assert ast.unparse(node.value) == "False"
-    assert [text.partition("(")[2][:20] for text in run] == ["f'def entry(address):"[:20]]
+    assert [text.partition("(")[2][:20] for text in run] == ["f'def entry(x):\\n    "[:20]]
 
 
 # -- the wheel ---------------------------------------------------------------------------------------

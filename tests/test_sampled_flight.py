@@ -404,7 +404,7 @@ sys.path.insert(0, sys.argv[1])
 from vehicle_samples import PAPER, begun, fleet
 from rigidfleet.kernel.engine import sampled
 problem, work, flight, state = begun([PAPER])
-sampled.fly_ticks(problem, work, flight, state, fleet.segment(1, 0, 0.1))
+sampled.fly_ticks(problem, work, flight, state, fleet.sampled_segment(1, 0, 0.1))
 assert "sampled" in native._loaded
 assert "numba" not in sys.modules
 """

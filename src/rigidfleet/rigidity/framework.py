@@ -91,13 +91,26 @@ class Framework:
         """Edges that could all be removed at once without loss of rank, long ones first."""
         if self.stress_dimension == 0:
             return np.zeros(0, dtype=np.int64)
-        from scipy.linalg import qr
-
         # Pivoting takes the largest remainder, so weights make short edges come first. The pivots still span the
         # range, since each is independent of those before.
         weight = self.lengths.min() / self.lengths
-        order = qr(weight * self.span.T, mode="r", pivoting=True)[1]
-        return np.sort(order[self.rank :])
+        kept = _independent_rows(weight[:, None] * self.span)
+        return np.setdiff1d(np.arange(len(self.edges)), kept)
+
+
+def _independent_rows(rows: Floats) -> list[int]:
+    """Indices of k independent rows of ``rows`` (., k), which has full rank; large rows first.
+
+    QR with column pivoting: each is the row with the largest part outside the span of those before. SciPy has it, but
+    loading SciPy takes longer than a check.
+    """
+    rest, kept = rows, []
+    for _ in range(rows.shape[1]):
+        kept.append(int((rest**2).sum(axis=1).argmax()))
+        q = rest[kept[-1]] / np.linalg.norm(rest[kept[-1]])
+        rest = rest - np.outer(rest @ q, q)
+        rest[kept] = 0.0
+    return kept
 
 
 def localised_flexes(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,7 +40,7 @@ def workspace_and_solver(
         steps = solvers.elimination_steps(len(points), edges)
         order = None if steps is None else ordering.prepare_order(steps, plan.problem.graph.edges)
     axes = plan.problem.has_frame or plan.problem.law.k_def > 0.0
-    dissect = cache(partial(solvers.dissection_order, points, edges))
+    dissect = partial(solvers.dissection_order, points, edges)
     solver = large_solver(plan.problem, Setup(order, dissect, *plan.residual_tolerances(), axes))
     plan.problem = problem_with_solver(solver, plan.problem)
     return solver.workspace, solver
