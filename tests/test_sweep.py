@@ -906,7 +906,7 @@ if __name__ == "__main__":
     mark = "changed"
     if sys.argv[1] == "threads":
         threading.Thread(target=threading.Event().wait, daemon=True).start()
-    with workers.processes(2) as pool:
+    with workers.start_processes(2) as pool:
         print(pool.submit(of_a_fork).result())
 """
 

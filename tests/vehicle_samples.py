@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet.kernel import fleet, quadrotor
+from rigidfleet.kernel import fleet
 from rigidfleet.kernel.engine import packing
 from rigidfleet.kernel.problem import (
     OPEN,
@@ -45,6 +45,8 @@ def derivatives(
     air: np.ndarray | None = None,
 ) -> np.ndarray:
     """Derivatives (N, 17) of states by the equations of motion; commands (N, 4), in still air or one that moves."""
+    from rigidfleet.kernel import quadrotor  # which loads the compiler
+
     out, none = np.empty_like(S), np.zeros(3)
     for i in range(len(S)):
         wind = none if air is None else air[i]
