@@ -462,19 +462,19 @@ def fly_with(plain: str) -> None:
         of = packing.pack(p).address, packing.pack(w).address
         native.library().record(*of, segment, out)
 
-    def bound_moves(watch: Any, problem: Any, state: Any) -> None:
+    def bound_distance_changes(watch: Any, problem: Any, state: Any) -> None:
         monitor.bound_changes(problem, state, watch.monitor)
 
     def distances(watch: Any, problem: Any, state: Any, first: int, end: int) -> None:
         monitor.watch_distances(first, end, problem, state, watch.monitor)
 
-    def clearances(watch: Any, problem: Any, state: Any, first: int, end: int, s: Any) -> None:
+    def search_clearances(watch: Any, problem: Any, state: Any, first: int, end: int, s: Any) -> None:
         for step in range(first, end):
             row = monitor.trail_row_of(step, state)
             t, h = state.trail.clock[row]
             obstacles.watch_step(state.trail.points[row], t, h, problem, s, watch.monitor)
 
-    def forces(watch: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
+    def search_forces(watch: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
         monitor.watch_forces(int(last), problem, work, state, watch.monitor)
 
     def avoid(*addresses: int) -> int:
@@ -485,10 +485,10 @@ def fly_with(plain: str) -> None:
             return int(guard.guard_forces(problem, work, flight, state, avoidance))
 
     watching: Any = native.Watch
-    watching.clearances = clearances
+    watching.search_clearances = search_clearances
     if plain == "monitor":
         monitor.call_recorder = record
-        for function in (bound_moves, distances, forces):
+        for function in (bound_distance_changes, distances, search_forces):
             setattr(native.Watch, function.__name__, function)
     else:
         word = ctypes.c_int64
