@@ -468,7 +468,9 @@ def fly_with(plain: str) -> None:
     def distances(watch: Any, problem: Any, state: Any, first: int, end: int) -> None:
         monitor.watch_distances(first, end, problem, state, watch.monitor)
 
-    def search_clearances(watch: Any, problem: Any, state: Any, first: int, end: int, s: Any) -> None:
+    def search_clearances(
+        watch: Any, problem: Any, state: Any, first: int, end: int, s: Any
+    ) -> None:
         for step in range(first, end):
             row = monitor.trail_row_of(step, state)
             t, h = state.trail.clock[row]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Mapping
+from datetime import date, time
 from typing import Any
 
 import tomli_w
@@ -51,7 +52,7 @@ def to_toml_data(value: Any) -> Any:
     if hasattr(value, "tolist"):  # NumPy's arrays and scalars
         value = value.tolist()
     match value:
-        case bool() | int() | float() | str():
+        case bool() | int() | float() | str() | date() | time():
             return value
         case list() | tuple():
             return [to_toml_data(item) for item in value]

@@ -195,7 +195,7 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
 
     def height(d: Floats, radii: Floats) -> Floats:
         overlap = d[0] ** 2 + d[1] ** 2 <= radii**2  # false for agents without a position
-        return np.where(overlap, np.abs(d[2]) - radii, np.inf)
+        return np.where(overlap & np.isfinite(d[2]), np.abs(d[2]) - radii, np.inf)
 
     return _least_of_pairs(r, radius, height)
 

@@ -212,12 +212,19 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
     return Course(goal, arrival, lambda: motion, lift)
 
 
+def motion_conflict(phase: Any, now: PhaseState) -> str:
+    """What keeps a phase from going on with the motion of slots, where files have ended in it; "" if nothing."""
+    goes_on = phase.control == "open" or (phase.follows_curves and phase.pieces[1].shape[1] > 1)
+    if now.rates is None or goes_on:
+        return ""
+    speed = np.linalg.norm(now.rates[0], axis=1)
+    if (most := float(speed.max())) <= _START_TOLERANCES[1]:
+        return ""
+    return f"begins while agent {speed.argmax() + 1} goes on at {most:.2f} m/s beside the others"
+
+
 def course_conflict(phase: Any, now: PhaseState) -> str:
     """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
-    if now.rates is not None and not phase.follows_curves:
-        speed = np.linalg.norm(now.rates[0], axis=1)
-        if (most := float(speed.max())) > _START_TOLERANCES[1]:
-            return f"begins while agent {speed.argmax() + 1} goes on at {most:.2f} m/s beside the others"
     if phase.bent:
         first = np.array(phase.control_points)[0]
         if now.slots is None or not np.abs(first - now.slots).max() < _START_TOLERANCES[0]:

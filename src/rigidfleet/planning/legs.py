@@ -186,7 +186,8 @@ class Leg:
         goal, blend, slots, rates = self.goal, self.reference, self.slots, None
         if self.phase.goal_moves and pose is not None and goal is not None and t < self.t_end:
             goal = copy_with(pose, T=pose.T if self.phase.turns_away else goal.T, named=goal.named)
-        if self.phase.follows_curves and len(blend.knots):  # which may end in motion
+        if self.phase.follows_curves and len(blend.knots) and t < blend.knots[-1] + _SHORTEST:
+            # They may end in motion; beyond their files, slots rest.
             own = Piecewise(blend.knots, blend.ways).states(np.minimum([t], blend.knots[-1]), 4)
             if np.abs(own[1]).max() > _MOVES:
                 slots, rates = own[0, 0], own[1:, 0]

@@ -112,7 +112,8 @@ class PhaseState:
     goal: Pose | None = None  # the pose to hold
     lost: Bools | None = None  # (N,) lost vehicles; None if there are none
     blend: Reference | None = None  # change of shape under way, if a loss has ended its phase
-    # Velocity, acceleration, jerk (3, N, 3) of the slots about the CM, body axes, if an abort has ended a phase.
+    # Velocity, acceleration, jerk (3, N, 3) of the slots about the CM, body axes, if an abort has ended a phase, or
+    # files have ended in motion.
     rates: Floats | None = None
 
     @property

@@ -17,7 +17,7 @@ from rigidfleet.mission.findings import Keys
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import ways
 from rigidfleet.planning.body_trajectories import points_passed
-from rigidfleet.planning.courses import course_conflict
+from rigidfleet.planning.courses import course_conflict, motion_conflict
 from rigidfleet.planning.legs import Departure, Leg, depart, leg_from, state_at_start
 from rigidfleet.planning.limits import Limit, Reached, limits_of, use_of_limits
 from rigidfleet.planning.reference import PhaseState
@@ -87,7 +87,12 @@ def complete_times(mission: Mission) -> Mission:
         return mission
     tables = mission.to_dict()["phases"]
     now = state_at_start(mission)
-    for k, phase in enumerate(mission.phases[: last + 1]):
+    for k, phase in enumerate(mission.phases[: last + 2]):
+        if problem := motion_conflict(phase, now):
+            remedy = "let the trajectories before end at rest, or let those of each vehicle go on"
+            raise ways.error_of_key(mission, k, "kind", None, problem, remedy)
+        if k > last:
+            break
         report_step(f"timing '{phase.name}'")
         leg = timed_leg(mission, phase, now, k)
         if leg.phase is not phase:
@@ -114,12 +119,8 @@ def timed_leg(mission: Mission, phase: Phase, now: PhaseState, number: int) -> L
     """
     departure = depart(mission, phase, now)
     if problem := course_conflict(phase, departure.now):
-        key = "file" if phase.follows_curves else "formation" if phase.bent else "kind"
+        key = "file" if phase.follows_curves else "formation"
         remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
-        if key == "kind":
-            remedy = (
-                "let the trajectories before end at rest, or let another 'follow' go on with them"
-            )
         raise ways.error_of_key(mission, number, key, None, problem, remedy)
     if not phase.automatic:
         return leg_from(mission, phase, departure)

@@ -95,7 +95,7 @@ def design(
     rows = rows[length <= reach]
     meshes = [np.arange(len(near)), *_edges_of_meshes(flat, near)]
     rigid = [x for x in meshes if len(x) >= wanted and _least_eigenvalue(rows[x]) >= _SINGULAR]
-    starts = [_remove_rows(rows, some, wanted) for some in rigid]
+    starts = [_remove_rows(rows, some, wanted) for some in rigid] or [meshes[0][:wanted]]
     chosen = max(starts, key=lambda some: _least_eigenvalue(rows[some]))
     rng = np.random.default_rng(seed)
     best, best_w = chosen, _least_eigenvalue(rows[chosen])

@@ -25,6 +25,9 @@ _STILL = 1e-5
 #: Relative difference below which two lengths or strengths are the same: rounding must not choose between them.
 _ALIKE = 1e-6
 
+#: Share of the original squares below which the remainder has too few correct digits.
+_SPENT = 1e-8
+
 
 class Flex(NamedTuple):
     """A motion that changes no distance of an edge to first order, up to a rigid motion of all agents."""
@@ -98,18 +101,27 @@ class Framework:
         return np.setdiff1d(np.arange(len(self.edges)), kept)
 
 
-def _independent_rows(rows: Floats) -> list[int]:
-    """Indices of k independent rows of ``rows`` (., k), which has full rank; large rows first.
+def _independent_rows(rows: Floats) -> Ints:
+    """Indices (k,) of k independent rows of ``rows`` (., k), which has full rank; large rows first.
 
-    QR with column pivoting: each is the row with the largest part outside the span of those before. SciPy has it, but
-    loading SciPy takes longer than a check.
+    QR with column pivoting: each is the row with the largest part outside the span of those before.
     """
-    rest, kept = rows, []
-    for _ in range(rows.shape[1]):
-        kept.append(int((rest**2).sum(axis=1).argmax()))
-        q = rest[kept[-1]] / np.linalg.norm(rest[kept[-1]])
-        rest = rest - np.outer(rest @ q, q)
-        rest[kept] = 0.0
+    k = rows.shape[1]
+    rest, Q, kept = (rows**2).sum(axis=1), np.zeros((k, k)), np.zeros(k, dtype=np.int64)
+    trusted = rest.max(initial=0.0)
+    for n in range(k):
+        if rest.max() < _SPENT * trusted:  # only rounding is left of the squares: recompute them
+            beyond = rows - rows @ Q[:n].T @ Q[:n]
+            rest = (beyond**2).sum(axis=1)
+            rest[kept[:n]] = 0.0
+            trusted = rest.max()
+        kept[n] = rest.argmax()
+        q = rows[kept[n]]
+        for _ in range(2):
+            q = q - q @ Q[:n].T @ Q[:n]
+        Q[n] = q / np.linalg.norm(q)
+        rest -= (rows @ Q[n]) ** 2
+        rest[kept[: n + 1]] = 0.0
     return kept
 
 
