@@ -167,7 +167,7 @@ def _best_clock_offset(logs: Logs, plan: Plan) -> float:
     least = 0.5 * min(end - begin, span[1] - span[0])
     best = np.inf, 0.0
     for offset in np.arange(begin - span[1] + least, end - span[0] - least + _STEP, _STEP).tolist():
-        best = min(best, (_setup_at(few, plan, offset)[0], offset))
+        best = min(best, (_setup_at(few, plan, offset)[0], offset), key=lambda x: x[0])
     return best[1]
 
 

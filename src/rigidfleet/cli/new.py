@@ -85,10 +85,7 @@ def new(
     options = {key: value for key, value in all_options.items() if value is not None}
     if not (options or quiet or json or show) and sys.stdin.isatty() and console.err().is_terminal:
         name, options = _ask_for_mission(name)
-    file = Path(name or "mission")
-    if not file.name:
-        raise RigidfleetError(f"{file}: is a folder. Name a file.")
-    file = mission_file(file)
+    file = mission_file(Path(name or "mission"))
     refuse_overwriting(file, force=force, other="give another name")
     if not show and (formations or shape or "cube") not in SHAPES:  # points make a show
         show, formations = True, formations or options.pop("shape")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from rigidfleet._common.files import make_folder, unwritable_error, write_file
 from rigidfleet.cli import console
-from rigidfleet.errors import ResultError
+from rigidfleet.errors import ResultError, RigidfleetError
 
 if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
@@ -138,7 +138,9 @@ class Files:
 
 
 def mission_file(path: Path) -> Path:
-    """The path of a mission: with .toml, as reading expects it."""
+    """The path of a mission: with .toml, as reading expects it; a folder is refused."""
+    if not path.name:
+        raise RigidfleetError(f"{path}: is a folder. Name a file.")
     return path if path.suffix == ".toml" else path.with_name(f"{path.name}.toml")
 
 

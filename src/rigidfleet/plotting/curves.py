@@ -422,7 +422,7 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
             st.draw_limit(ax, limit, f"limit {limit:g} m")
         return
     ax.plot(result.time, values, color=st.TONES[0])
-    st.draw_limit(ax, limit, f"limit {limit:g} m")
+    st.draw_limit(ax, limit, f"limit {limit:g} m" if limit or name == "people" else "contact")
     if name == "separation":
         _draw_planned_separation(ax, result)
         if (flying := QUANTITIES["separation_flying"].limit_of(result.mission)) is not None:

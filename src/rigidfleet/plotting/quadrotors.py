@@ -77,7 +77,7 @@ def _draw_greatest_rotor(ax: Axes, result: Result) -> None:
     if between is not None:
         between = between._replace(value=100.0 * between.value / limits[between.who], other=-1)
     ax.set_ylabel("share of the rotor limit [%]")
-    Panel(ax, result, share, "%", between).draw([(100.0, "limit", st.ALERT)])
+    Panel(ax, result, share, "%", between).draw([(100.0, "limit 100 %", st.ALERT)])
 
 
 def _draw_rotors_of_nearest(ax: Axes, result: Result) -> None:

@@ -138,6 +138,7 @@ def draw_obstacle_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     from matplotlib.collections import LineCollection
     from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
 
     colour = st.ALERT if shape.zone else COLOUR
     points = shape.surface.triangles.reshape(-1, 3)[:, :2]
@@ -148,9 +149,16 @@ def draw_obstacle_from_above(ax: Axes, shape: DrawnObstacle) -> None:
         low_to_high = LinearSegmentedColormap.from_list("terrain", ["#F4F1EA", COLOUR])
         ax.contourf(x, y, z.T, 8, cmap=low_to_high, alpha=0.5, zorder=0.8)
         ax.contour(x, y, z.T, 8, colors=colour, linewidths=0.4, alpha=0.8, zorder=0.9)
+    low, high = points.min(axis=0), points.max(axis=0)
+    corner = Path(
+        [low, [high[0], low[1]], high]
+    )  # of a terrain, which has its contours: it is as wide
+    # A terrain has its contours: a corner of it shows how wide it is.
+    low, high = points.min(axis=0), points.max(axis=0)
+    corner = Path([low, [high[0], low[1]], high])
     for at, share in zip(shape.at, _opacities(shape), strict=True):
         opacity = 0.0 if shape.is_terrain else 0.3 if not shape.zone else 0.1
-        path = seen_from_above(shape.surface.triangles + at)
+        path = corner if shape.is_terrain else seen_from_above(shape.surface.triangles + at)
         patch = ax.add_patch(PathPatch(path, **look, alpha=opacity * float(share)))
         if shape.zone:
             lines = list((shape.surface.lines + at)[..., :2])

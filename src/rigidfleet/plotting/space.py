@@ -244,7 +244,7 @@ def _set_ticks(ax: Axes3D) -> None:
     for axis, span in zip((ax.xaxis, ax.yaxis, ax.zaxis), spans, strict=True):
         axis.set_major_locator(MaxNLocator(max(2, round(6 * span / max(spans)))))
         axis.set_tick_params(labelsize=7, pad=-1, color=st.FAINT)
-        axis.labelpad = -3.0
+        axis.labelpad = 0.0
     ax.set_box_aspect([float(s) for s in spans])
     ax.patch.set_visible(False)
 

@@ -267,8 +267,8 @@ def write_above(ax: Axes, words: str, colour: str = INK) -> None:
     letters = int(_LETTERS * ax.bbox.width / _DPI)
     over_phases = any(text.get_gid() == "phase" for text in ax.texts)
     ax.set_title(
-        textwrap.fill(whole, letters), loc="right", pad=13.0 if over_phases else 3.0, fontsize=7.5, color=colour,
-        fontweight="normal", parse_math=False, gid="words",
+        textwrap.fill(whole, letters, break_on_hyphens=False), loc="right", pad=13.0 if over_phases else 3.0,
+        fontsize=7.5, color=colour, fontweight="normal", parse_math=False, gid="words",
     )  # fmt: skip
 
 

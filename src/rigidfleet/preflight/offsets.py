@@ -116,6 +116,7 @@ def offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     way, remedy = preflight.planned_phases, ""
     if not mission.tracking.integral:
         remedy = f"; tracking has no integral: raise the first weight in tracking.Q (now {mission.tracking.Q[0]:g})"
+        remedy += ", or set tracking.integral" if mission.vehicle_models is not None else ""
     for planned, off in zip(way, slot_offsets(mission, way), strict=True):
         far = float(np.linalg.norm(off, axis=2).max())
         if planned.leg.end > mission.first_loss or far < _LEAST:

@@ -54,9 +54,9 @@ def design(
     hold there), plus `extra` redundant ones. Let M be the sum of a a^T over the chosen rows a of J (without the rigid
     motions), and w its smallest eigenvalue. Edges are exchanged, the best pair at a time, as long as this lowers the
     barrier potential tr (M - t)^-1, for t = 0 and then closer and closer to w (Batson, Spielman and Srivastava,
-    2012). The search starts from all candidates thinned out, or Delaunay's triangulation or the convex hull, if it has
-    enough edges, whichever is best, and again from perturbed designs while its budget lasts: a tenth of a second for 8
-    agents, one or two seconds for 30 to 100.
+    2012). The search starts from all candidates thinned out, from Delaunay's triangulation or from the convex hull,
+    whichever is best, and again from perturbed designs while its budget lasts: a tenth of a second for 8 agents, one
+    or two seconds for 30 to 100.
 
     Parameters
     ----------
@@ -94,8 +94,7 @@ def design(
         return near
     rows = rows[length <= reach]
     meshes = [np.arange(len(near)), *_edges_of_meshes(flat, near)]
-    rigid = [x for x in meshes if len(x) >= wanted and _least_eigenvalue(rows[x]) >= _SINGULAR]
-    starts = [_remove_rows(rows, some, wanted) for some in rigid] or [meshes[0][:wanted]]
+    starts = [_add_rows(rows, _remove_rows(rows, some, wanted), wanted) for some in meshes]
     chosen = max(starts, key=lambda some: _least_eigenvalue(rows[some]))
     rng = np.random.default_rng(seed)
     best, best_w = chosen, _least_eigenvalue(rows[chosen])
@@ -200,6 +199,8 @@ def _remove_rows(rows: Floats, chosen: Ints, wanted: int) -> Ints:
 
     Without row a, tr M^-1 grows by |M^-1 a|^2 / (1 - a^T M^-1 a).
     """
+    if len(chosen) <= wanted or _least_eigenvalue(rows[chosen]) < _SINGULAR:
+        return chosen[:wanted]
     share = 0.1
     while (surplus := len(chosen) - wanted) > 0:
         A = rows[chosen]
@@ -213,6 +214,20 @@ def _remove_rows(rows: Floats, chosen: Ints, wanted: int) -> Ints:
             share /= 2  # rank lost: remove fewer at a time
             continue
         chosen = chosen[keep]
+    return chosen
+
+
+def _add_rows(rows: Floats, chosen: Ints, wanted: int) -> Ints:
+    """The chosen rows and the most useful of the others, (wanted,); arbitrary others if the chosen rows lack rank."""
+    while len(chosen) < wanted:
+        A = rows[chosen]
+        other = np.setdiff1d(np.arange(len(rows)), chosen)
+        w = _least_eigenvalue(A)
+        if w < _SINGULAR:
+            return np.append(chosen, other[: wanted - len(chosen)])
+        BG = rows[other] @ np.linalg.inv(A.T @ A - 0.5 * w * np.eye(A.shape[1]))
+        gain = (BG**2).sum(axis=1) / (1 + (BG * rows[other]).sum(axis=1))
+        chosen = np.append(chosen, other[gain.argmax()])
     return chosen
 
 

@@ -111,9 +111,11 @@ def finite_numbers(x: ArrayLike, shape: tuple[int, ...]) -> Floats:
     """
     try:
         array = np.asarray(x)
+        if array.dtype.kind in "SU":
+            raise ValueError("text")
         if array.dtype.kind != "c":
             array = np.array(array, dtype=np.float64, order="C")
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(reprlib.repr(x)) from None
     if array.dtype.kind == "c":
         raise ValueError("complex numbers")

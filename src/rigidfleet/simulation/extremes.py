@@ -42,6 +42,8 @@ _TOUCH, _INSTANT = 1e-6, 1e-6
 _TURN = 0.1
 #: Agents that are asked for their nearest one, to choose how far the list reaches.
 _ASKED = 2000
+#: Vehicles of a crowd: beyond, lists of the pairs near a long step would take hundreds of megabytes.
+_CROWD = 2000
 #: The monitor's number of each quantity that it finds; the clearances at the start and the end belong to the flight.
 _NAMES = {q.name: getattr(records, q.name.upper()) for q in QUANTITIES.values() if q.monitored}
 #: Quantities of a direction, which are searched for where one of them has a limit.
@@ -162,7 +164,9 @@ class CurveWatch:
             self.boundaries.take_steps(*steps_in_world(clock, points, problem), self.left)
         if self.n > _FEW:
             for step in range(first, steps):
-                self._watch_step(problem, work, state, step)
+                row = _trail_rows(state, (step,))
+                part = state.trail.clock[row], state.trail.points[row]
+                self._watch_step(problem, work, state, *part)
             return
         self.monitor.distances(problem, state, first, steps)
         self._find_contacts(problem, work, state, np.arange(first, steps))
@@ -274,11 +278,17 @@ class CurveWatch:
             )
 
     def _watch_step(
-        self, problem: Problem, work: Workspace, state: records.IntegratorState, step: int
+        self,
+        problem: Problem,
+        work: Workspace,
+        state: records.IntegratorState,
+        clock: Floats,
+        points: Floats,
     ) -> None:
-        """Monitor the distances of one step, in which only the listed pairs matter."""
-        row = _trail_rows(state, (step,))
-        clock, points = state.trail.clock[row], state.trail.points[row]
+        """Monitor the distances of one step (1, 2), (1, 5, n), in which only the listed pairs matter.
+
+        In a crowd, whose list would be too long for a step in which vehicles go far, its halves are watched instead.
+        """
         trail = records.Trail(clock, points, state.trail.gauge[:0], state.trail.start)
         alone = state._replace(trail=trail)
         self.monitor.bound_distance_changes(problem, alone)
@@ -286,7 +296,12 @@ class CurveWatch:
         if not self.stacks:
             moved[1] = 0.0
         if (self.moved + moved > self.spare).any():
-            self._list_near_pairs(problem, points[0, 0], float(moved.max()))
+            far = 0.0 if self.n > _CROWD else float(moved.max())
+            self._list_near_pairs(problem, points[0, 0], far)
+            if moved.max() > self.spare:
+                for half in zip(*_halve_step(*clock[0], points[0]), strict=True):
+                    self._watch_step(problem, work, state, *(x[None] for x in half))
+                return
         self.moved += moved
         self.monitor.distances(problem, alone, 0, 1)
         self._find_contacts(problem, work, alone, np.zeros(1, dtype=np.int64))

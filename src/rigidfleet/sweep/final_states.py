@@ -104,7 +104,7 @@ def _evaluate(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict
     wrong = {name: np.zeros(count, dtype=bool) for name in ("distances", "shape", "handedness")}
     metrics = {"shape": np.full(count, np.nan), "handed": np.full(count, np.nan)}
     formation, t, last = None, 0.0, len(mission.phases) - 1
-    for index, (phase, r) in enumerate(zip(mission.phases, flown.ends, strict=True)):
+    for index, (phase, ends) in enumerate(zip(mission.phases, flown.ends, strict=True)):
         shaping = phase.shaping
         length = seconds(phase.duration or 0.0) if phase.until is None else phase.until - t
         t += length
@@ -114,6 +114,8 @@ def _evaluate(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict
         judged = shaping is not None or index == last
         allowed = mission.formations[formation].greatest_error
         lengths = mission.formation_distances(formation)
+        # A flight that did not finish may have ended nowhere; it has no metrics.
+        r = np.where(np.isfinite(ends).all(axis=(1, 2), keepdims=True), ends, 0.0)
         wide = max_edge_error(r, mission.formation_edges(formation), lengths)
         blending = (
             shaping is not None and shaping.reference != "step" and shaping.least_time > length

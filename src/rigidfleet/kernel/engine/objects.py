@@ -15,8 +15,8 @@ from rigidfleet.kernel.compiler.levels import HOST, KEY, target_instruction_leve
 
 #: The functions of each library of machine code, by name, with how many words they take: integers, or addresses of
 #: named tuples. What they return is a word. Flights of points load the first library, those of vehicles the second,
-#: too, those with avoidance the third, those with obstacles that move or are no plain boxes the fourth. Functions of the
-#: solver of large formations take the address of their arguments, and return a double. Each is in its own object.
+#: too, those with avoidance the third, those with obstacles that move or are no plain boxes the fourth. Functions of
+#: the solver of large formations take the address of their arguments, and return a double. Each is in its own object.
 ENTRIES = {
     "flight": {
         "integrate": 4,  # problem, workspace, integrator, segment
