@@ -1182,7 +1182,7 @@ def test_rotors_of_one_model_stand_beside_their_limit():
     for i in range(3):
         assert line_of(above, i + 1).max() == pytest.approx(30.0 + 10.0 * i)
     assert [line.get_ydata()[0] for line in by_gid(above, "limit")] == [pytest.approx(100.0)]
-    assert "limit" in texts(above)
+    assert "limit 100 %" in above.get_title(loc="right")
     assert below.get_ylabel() == "rotors of agent 3 [N]"
     assert [line.get_ydata().max() for line in below.lines[:4]] == pytest.approx(
         [1.5, 1.5, 2.5, 1.5]

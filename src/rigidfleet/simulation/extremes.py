@@ -299,7 +299,7 @@ class CurveWatch:
             far = 0.0 if self.n > _CROWD else float(moved.max())
             self._list_near_pairs(problem, points[0, 0], far)
             if moved.max() > self.spare:
-                for half in zip(*_halve_step(*clock[0], points[0]), strict=True):
+                for half in zip(*_halve_step(*clock.ravel(), points[0]), strict=True):
                     self._watch_step(problem, work, state, *(x[None] for x in half))
                 return
         self.moved += moved
