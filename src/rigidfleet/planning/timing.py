@@ -76,7 +76,7 @@ def complete_times(mission: Mission) -> Mission:
     ------
     MissionError
         No transition keeps the separation, no time of a phase keeps the limits, its start is not known before the
-        flight, or a phase ends too early for the times before it.
+        flight, a phase ends too early for the times before it, or vehicles end in motion that the next does not go on.
     """
     mission = expand_mission(mission)
     last = max(

@@ -111,14 +111,14 @@ def finite_numbers(x: ArrayLike, shape: tuple[int, ...]) -> Floats:
     """
     try:
         array = np.asarray(x)
-        if array.dtype.kind in "SU":
-            raise ValueError("text")
-        if array.dtype.kind != "c":
+        if array.dtype.kind not in "cSU":
             array = np.array(array, dtype=np.float64, order="C")
     except (TypeError, ValueError, OverflowError):
         raise ValueError(reprlib.repr(x)) from None
     if array.dtype.kind == "c":
         raise ValueError("complex numbers")
+    if array.dtype.kind in "SU":
+        raise ValueError(reprlib.repr(x))
     if array.shape != shape:
         raise ValueError(f"an array of shape {array.shape}")
     if not np.isfinite(array).all():

@@ -296,10 +296,11 @@ class CurveWatch:
         if not self.stacks:
             moved[1] = 0.0
         if (self.moved + moved > self.spare).any():
-            far = 0.0 if self.n > _CROWD else float(moved.max())
+            begin, length = clock.ravel()
+            far = 0.0 if self.n > _CROWD and length > _INSTANT else float(moved.max())
             self._list_near_pairs(problem, points[0, 0], far)
             if moved.max() > self.spare:
-                for half in zip(*_halve_step(*clock.ravel(), points[0]), strict=True):
+                for half in zip(*_halve_step(begin, length, points[0]), strict=True):
                     self._watch_step(problem, work, state, *(x[None] for x in half))
                 return
         self.moved += moved
