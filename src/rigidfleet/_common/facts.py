@@ -136,15 +136,16 @@ class FactTable:
             names = f"{'words' * words} {level}".strip()
             return _LOOK if not kind else f' class="{names}"' if names else ""
 
+        columns = self.columns
         heads = "".join(
             f"<th{cell_attribute(words)}>{html.escape(f'{name} [{unit}]' if unit else name)}</th>"
-            for name, unit, words in self.columns
+            for name, unit, words in columns
         )
         body = f"<thead><tr>{heads}</tr></thead>" * (not self.bare)
         for row, cells in zip(self.rows, self.cells, strict=True):
             line = "".join(
                 f"<td{cell_attribute(words, cell.level)}>{cell.html()}</td>"
-                for cell, (*_, words) in zip(cells, self.columns, strict=True)
+                for cell, (*_, words) in zip(cells, columns, strict=True)
             )
             body += f"<tr{cell_attribute(False, row.level) if kind else ''}>{line}</tr>"
         return f"<table{f' class={kind!r}' if kind else ''}>{body}</table>"

@@ -93,6 +93,11 @@ class PhasePlan(Leg):
         # Beyond, it takes longer than their flight.
         return super().certificate if len(self.radius) <= bounds.ALL_PAIRS else None
 
+    def postpone_events(self, postponed_time: Callable[[float], float]) -> None:
+        """Move its end, the arrival and the points on its way to other times [s]."""
+        self.t_end, self.arrival = postponed_time(self.t_end), postponed_time(self.arrival)
+        self.through = tuple(at | {"time": postponed_time(at["time"])} for at in self.through)
+
     @property
     def is_large(self) -> bool:
         """Whether a method for large formations solves for the multipliers."""

@@ -235,8 +235,7 @@ class Leader:
             return time + lost
 
         plan = self.plan
-        plan.t_end, plan.arrival = postponed_time(plan.t_end), postponed_time(plan.arrival)
-        plan.through = tuple(at | {"time": postponed_time(at["time"])} for at in plan.through)
+        plan.postpone_events(postponed_time)
         if begun < (blend := plan.reference).t0 + blend.T_b:
             plan.reference = blend._replace(t0=blend.t0 + lost)
 

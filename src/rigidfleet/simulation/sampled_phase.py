@@ -218,8 +218,7 @@ class SampledPhase(ActivePhase):
                 return time
             return due + float(np.interp(due, [passed, max(now, passed + 1e-9)], [before, late]))
 
-        plan.t_end, plan.arrival = postponed_time(plan.t_end), postponed_time(plan.arrival)
-        plan.through = tuple(at | {"time": postponed_time(at["time"])} for at in plan.through)
+        plan.postpone_events(postponed_time)
         if self.slowed is None and (self.sampled.tau[:, PACE] < _SLOWED).any():
             self.slowed = t, int(self.sampled.tau[:, WORST].argmax())
 

@@ -110,7 +110,7 @@ def outcome(table: Table) -> Figure | None:
     """Success rate over the number of runs, with its confidence interval, and the failures of each check."""
     if not len(table.run):
         return None
-    reasons = failure_counts(table)
+    reasons = failure_counts(table.reason)
     fig = _titled_figure(table, "Outcome", st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6))
     left, right = fig.subplots(1, 2, width_ratios=(3, 2))
     n = np.unique(np.geomspace(1, len(table.run), 200).astype(int))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import groupby
 from statistics import NormalDist
@@ -257,7 +257,7 @@ def summarise(table: store.Table) -> Summary:
         sweep.runs,
         len(table.run),
         pass_rate(table.passed),
-        failure_counts(table),
+        failure_counts(table.reason),
         _examples_by_reason(table),
         percentiles,
         correlations_by_strength(table),
@@ -286,9 +286,9 @@ def fault_rates(table: store.Table) -> list[Borne]:
     return cases
 
 
-def failure_counts(table: store.Table) -> dict[str, int]:
-    """Number of runs that failed each check, most frequent first."""
-    failed = [reason for reasons in table.reason for reason in reasons.split(", ") if reason]
+def failure_counts(reasons: Iterable[str]) -> dict[str, int]:
+    """Number of runs that failed each check, most frequent first, of the reasons of each run."""
+    failed = [check for checks in reasons for check in checks.split(", ") if check]
     return dict(Counter(failed).most_common())
 
 

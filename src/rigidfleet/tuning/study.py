@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack, suppress
@@ -33,6 +32,7 @@ from rigidfleet.mission.loading import as_mission
 from rigidfleet.sweep import Sweep, SweepProgress, Table, fly
 from rigidfleet.sweep.record import BROKEN, REFUSED
 from rigidfleet.sweep.runner import WORTH
+from rigidfleet.sweep.summary import failure_counts
 from rigidfleet.sweep.workers import start_processes
 from rigidfleet.tuning.gains import Gains, GainSpace, Screen, feasible_points, own_gains, with_gains
 from rigidfleet.tuning.outcome import Flown, Tuned
@@ -194,9 +194,8 @@ def _flown_of_candidates(table: Table, candidates: Sequence[Gains], seeds: int) 
     measurements = []
     for k, gains in enumerate(candidates):
         rows = slice(k * seeds, (k + 1) * seeds)
-        reasons = [reason.split(", ") for reason in table.reason[rows] if reason]
-        ended = sum(not _NOT_FLOWN.isdisjoint(failed) for failed in reasons)
-        failed = dict(Counter(reason for failed in reasons for reason in failed).most_common())
+        ended = sum(not _NOT_FLOWN.isdisjoint(reason.split(", ")) for reason in table.reason[rows])
+        failed = failure_counts(table.reason[rows])
         values = {name: table.metrics[name][rows].tolist() for name in OBJECTIVES.values()}
         measurements.append(
             Flown(gains, int(table.passed[rows].sum()), ended, seeds, values, failed)

@@ -93,6 +93,8 @@ _STAYING: list[Any] = []
 
 
 def _copy_function(function: FunctionType, name: str, instead: dict[str, Any]) -> FunctionType:
+    if unknown := instead.keys() - {*function.__code__.co_names}:
+        raise TypeError(f"{function.__qualname__} uses no {', '.join(sorted(unknown))}")
     copy = FunctionType(function.__code__, function.__globals__ | instead, name)
     copy.__module__, copy.__qualname__ = function.__module__, name
     return copy
