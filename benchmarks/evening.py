@@ -129,7 +129,7 @@ def turning(degrees: float) -> Floats:
 def judge(kind: str, seed: int) -> dict[str, float]:
     """What holds of one flight: shares of 0 to 1, by what is judged."""
     random = np.random.default_rng(seed)
-    motion = rf.simulate(mission(seed)).motion(flown=True)
+    motion = rf.simulate(mission(seed)).setpoints_at_samples(flown=True)
     way = ways_of(motion, slice(None))
     log, (offset, turn, shift, own) = log_of(way, kind, random)
     fine = np.arange(BEGIN, END, 1e-3)

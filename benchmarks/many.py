@@ -87,7 +87,7 @@ EXPONENT, JUDGING, FLAT, SHOW, MEMORY = 1.1, 1.2, 5e-3, 60.0, 24.0
 ROUNDS = 3
 #: What is judged.
 WORK: dict[str, Callable[[Result], object]] = {
-    "separation": lambda x: proximity.separation_of_left(
+    "separation": lambda x: proximity.separation_of_remaining(
         x.position, x.mission.agents.radius, x.left
     ),
     "clearance": lambda x: proximity.obstacle_clearances(

@@ -337,7 +337,7 @@ def missions(rounds: int) -> list[Row]:
     sweep = Sweep.of(load_mission(name), vary=[gain], runs=RUNS * rounds, seed=1)
     fly_runs(sweep, range(8))
     windy(0, 8)
-    flown = [simulate(Mission.from_dict(sweep.varied(k))) for k in range(2)]
+    flown = [simulate(Mission.from_dict(sweep.document_of_run(k))) for k in range(2)]
     lasts = flown[0].time[-1]
 
     def of_sweep(k: int) -> float:

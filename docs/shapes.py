@@ -15,7 +15,7 @@ from rigidfleet.math import pid
 from rigidfleet.math.constraint_jacobian import filter_factors
 from rigidfleet.mission import Mission
 from rigidfleet.plotting import sketches, space
-from rigidfleet.plotting.graph import formation_graphs
+from rigidfleet.plotting.graph import formation_graphs_figure
 from rigidfleet.plotting.style import DASHES, FLOWN, GREY, INK, PALETTE
 from rigidfleet.rigidity import Kind, analyse, realisations
 from rigidfleet.rigidity.design import design
@@ -41,7 +41,7 @@ def _drawn(formations: dict[str, tuple[np.ndarray, Any]]) -> Figure:
         }
     )
     judged = {name: analyse(p, np.asarray(edges)) for name, (p, edges) in formations.items()}
-    return formation_graphs(mission, judged)
+    return formation_graphs_figure(mission, judged)
 
 
 def flexes() -> Figure:

@@ -16,7 +16,7 @@ from rigidfleet.math.margins import (
     Lag,
     LoopGains,
     formation_loops,
-    largest_pole,
+    largest_stable_pole,
     stability_margins,
     tracking_loops,
 )
@@ -251,7 +251,7 @@ def _margins() -> str:
                 (
                     name if delay == 0 else "",
                     f"{1e3 * delay:.0f}",
-                    f"{largest_pole(loops, law):.2f}",
+                    f"{largest_stable_pole(loops, law):.2f}",
                     f"{rule:.1f}",
                     *(
                         f"{math.degrees(m.phase):.0f}°, {1e3 * m.delay:.0f} ms"

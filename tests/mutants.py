@@ -463,7 +463,7 @@ def fly_with(plain: str) -> None:
         native.library().record(*of, segment, out)
 
     def bound_distance_changes(watch: Any, problem: Any, state: Any) -> None:
-        monitor.bound_changes(problem, state, watch.monitor)
+        monitor.bound_distance_changes(problem, state, watch.monitor)
 
     def distances(watch: Any, problem: Any, state: Any, first: int, end: int) -> None:
         monitor.watch_distances(first, end, problem, state, watch.monitor)

@@ -5,10 +5,10 @@ import pytest
 from scipy.signal import impulse, lsim
 
 from rigidfleet.assessment import assess
-from rigidfleet.math.margins import Lag, LoopGains, overshoot_time
+from rigidfleet.math.margins import Lag, LoopGains, tracking_error_gain
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import MODELS
-from rigidfleet.planning.vehicles import lag_times
+from rigidfleet.planning.vehicles import overshoot_times
 from rigidfleet.preflight.check import check
 from rigidfleet.simulation.flight import simulate
 
@@ -177,7 +177,7 @@ def test_the_reserve_bounds_what_a_vehicle_leaves_its_reference_by(lag):
             systems.append((np.polymul(np.r_[s, 0.0], share), below))
     time = np.linspace(0.0, 20.0, 20_001)
     bounds = [np.trapezoid(np.abs(impulse(system, T=time)[1]), time) for system in systems]
-    found = overshoot_time(lag, law, 0.0)
+    found = tracking_error_gain(lag, law, 0.0)
     assert found == pytest.approx(max(bounds), rel=0.02)
     jerk = np.repeat(np.random.default_rng(1).choice([-1.0, 1.0], 201), 100)[: len(time)]
     assert max(np.abs(lsim(system, jerk, time)[1]).max() for system in systems) < found
@@ -185,9 +185,9 @@ def test_the_reserve_bounds_what_a_vehicle_leaves_its_reference_by(lag):
 
 def test_points_need_no_reserve():
     """Points that give any force at once leave none, with control that is continuous or sampled."""
-    assert not lag_times(points(FLY)).any()
+    assert not overshoot_times(points(FLY)).any()
     sampled = {"vehicles": {"x": {"model": "point", "mass": 1.0}}}
-    assert not lag_times(
+    assert not overshoot_times(
         points(FLY, agents={"vehicle": "x", "position": STANDING}, **sampled)
     ).any()
 

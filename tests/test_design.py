@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull
 
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.rigidity import RigidityClass, analyse, full_rank, jacobian
-from rigidfleet.rigidity.design import design, limits, mission_fragment
+from rigidfleet.rigidity.design import design, free_motions_text, mission_fragment
 
 CUBE = shapes.slots("cube", 4.0, 8)
 BEST_CUBE = (3 - np.sqrt(5)) / 2  # 0.38197
@@ -134,14 +134,14 @@ def test_same_seed_same_graph():
 def test_limits_of_flat_shapes(name, n, words):
     """What distances do not hold is what the analysis finds free, for every graph."""
     p = shapes.slots(name, 4.0, n)
-    assert words in limits(p)
-    assert f"so {len(analyse(p, graphs.complete_graph(n)).flexes)} motion" in limits(p)
+    assert words in free_motions_text(p)
+    assert f"so {len(analyse(p, graphs.complete_graph(n)).flexes)} motion" in free_motions_text(p)
 
 
 @pytest.mark.parametrize("p", [CUBE, CUBE[:3], CUBE[:2], CUBE[:1]])
 def test_no_limits_where_distances_suffice(p):
     """A spatial shape, a triangle, a pair and one agent have no motion that distances cannot hold."""
-    assert limits(p) == ""
+    assert free_motions_text(p) == ""
 
 
 def test_bad_requests_are_refused():

@@ -74,7 +74,7 @@ def test_run_reads_a_file_once(texts, tmp_path, capsys):
 def test_planning_reads_and_writes_no_text(mission, texts):
     """Times, ways and transitions take their places as data; the mission then has numbers, and writes as before."""
     planned = complete_times(mission)
-    assert not any(phase.automatic for phase in planned.phases)
+    assert not any(phase.auto_keys for phase in planned.phases)
     assert all(phase.flown_as_written and not phase.replaced for phase in planned.phases)
     assert texts == {"read": 0, "written": 0}
     again = complete_times(rf.Mission.from_toml(planned.text))
@@ -84,7 +84,7 @@ def test_planning_reads_and_writes_no_text(mission, texts):
 def test_an_assignment_is_not_lost(texts):
     """A mission with another assignment keeps the times that were computed for it."""
     planned = complete_times(mission_of(FLY)).with_assignment("shortest")
-    assert not any(phase.automatic for phase in planned.phases)
+    assert not any(phase.auto_keys for phase in planned.phases)
     assert texts == {"read": 0, "written": 0}
 
 

@@ -250,7 +250,7 @@ def flown(
     plan: rf.Result, random: Any, *, late: Any = 0.0, turn: float = 0.0, shift: Any = 0.0
 ) -> Trajectories:
     """A log of a flight of the plan: its clock late [s], its axes turned [deg], its vehicles shifted [m]."""
-    motion = plan.motion(flown=True)
+    motion = plan.setpoints_at_samples(flown=True)
     late, angle = np.broadcast_to(late, plan.n_agents), np.radians(turn)
     t = np.arange(plan.time[0], plan.time[-1], 1.0 / 25.0)
     c, s = np.cos(angle), np.sin(angle)
@@ -463,7 +463,7 @@ def test_all_that_is_judged_has_an_interval(benchmark_named: Any, count: int) ->
     for seed in range(count):
         true = rf.simulate(guarded(evening, seed))
         t = np.arange(0.0, float(true.time[-1]) + 1e-9, 0.02)
-        x = ways_of(true.motion(flown=True), slice(None)).at(t)[:, :, :3]
+        x = ways_of(true.setpoints_at_samples(flown=True), slice(None)).at(t)[:, :, :3]
         x = x + evening.noise(np.random.default_rng(seed), x.shape, "white")
         _, verdict = judge_log(logged([t] * 3, [*x.swapaxes(0, 1)]), plan, Doubts(SIGMA))
         own = {(check.check, check.phase): check for check in verdict.checks}

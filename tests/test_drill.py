@@ -325,7 +325,7 @@ def test_the_summary_has_the_share_of_each_fault(drilled):
             assert case["worst"]["run"] in failed
             assert case["worst"]["detail"] == table.detail[case["worst"]["run"]]
     assert {0, 3} & {case["failed"]["count"] for case in data}
-    figure = figures.shares(table)
+    figure = figures.failure_share_figure(table)
     assert figure is not None
     heights = [bar.get_height() for ax in figure.axes if ax.containers for bar in ax.containers[0]]
     assert heights == pytest.approx([100 * case["failed"]["rate"] for case in data])
@@ -334,7 +334,7 @@ def test_the_summary_has_the_share_of_each_fault(drilled):
     assert [row.cells[3] for row in shown.rows] == [
         f"{case['failed']['count']} of 3" for case in data
     ]
-    sentences = summary.rehearsals()
+    sentences = summary.drill_sentences()
     assert sentences[0] == f"{summary.success.count} of {len(table.run)} faults are harmless."
     assert [x.partition(":")[0] for x in sentences[1:]] == ["Late", "Rotated"]
     for case in (case for case in data if case["fault"] == "late"):
@@ -362,26 +362,29 @@ def test_faults_that_are_flown_are_missions():
     sweep = Sweep.of(mission, [], drill={"wind": [4.0], "links": [5], "lost": [2]}, seed=3)
     assert sweep.runs == 3 * 20
     assert sweep.name == "change-of-picture-drill"
-    winds = [np.array(sweep.varied(k)["disturbances"]["wind"]) - [1, 2, 0] for k in range(0, 60, 3)]
+    winds = [
+        np.array(sweep.document_of_run(k)["disturbances"]["wind"]) - [1, 2, 0]
+        for k in range(0, 60, 3)
+    ]
     assert np.allclose(np.linalg.norm(winds, axis=1), 4.0)
     assert all((np.array(winds)[:, axis] * sign).max() > 2 for axis in (0, 1) for sign in (1, -1))
     for k in range(1, 60, 3):
-        links = sweep.varied(k)["network"]["lost"]
+        links = sweep.document_of_run(k)["network"]["lost"]
         pairs = {tuple(sorted(each["between"])) for each in links}
         assert len(pairs) == 5
         assert all(1 <= i < j <= n for i, j in pairs)
-        lost = sweep.varied(k + 1)["disturbances"]["lost"]
+        lost = sweep.document_of_run(k + 1)["disturbances"]["lost"]
         assert lost[0] == {"agent": 3, "time": 5.0}
         assert len({each["agent"] for each in lost}) == 3
         assert all(0 < each["time"] < 60 for each in (*links, *lost))
-    assert sweep.varied(4) == sweep.varied(4) != sweep.varied(7)
+    assert sweep.document_of_run(4) == sweep.document_of_run(4) != sweep.document_of_run(7)
 
 
 def test_a_fault_that_is_flown_has_the_verdict_of_its_mission():
     """A run with wind fails as the verdict on the mission with this wind does; one late by nothing passes."""
     sweep = Sweep.of("change-of-picture", [], drill={"wind": [6.0], "trials": 1})
     (row,) = fly_runs(sweep, [0])
-    verdict = rf.assess(rf.simulate(rf.Mission.from_dict(sweep.varied(0))))
+    verdict = rf.assess(rf.simulate(rf.Mission.from_dict(sweep.document_of_run(0))))
     assert row.passed == verdict.passed
     assert row.reason.split(", ") == list(
         dict.fromkeys(c.check for c in verdict.checks if not c.passed)

@@ -625,7 +625,7 @@ def test_a_lost_vehicle_is_exported_as_it_fell(tmp_path):
     jumps = np.flatnonzero(np.diff(lost.time) < 1e-9)
     (k,) = jumps[lost.phase[jumps] == lost.phase[jumps + 1]]
     assert lost.time[k] == 30.0
-    jerk = lost.motion(flown=True).state[:, 3]
+    jerk = lost.setpoints_at_samples(flown=True).state[:, 3]
     assert abs(jerk[k] - jerk[k - 1]).max() < 0.1
     assert abs(jerk[k + 1, 1]).max() < 1e-6  # in free fall
     made = export(lost, tmp_path / "fall.csv", "setpoints", flown=True)

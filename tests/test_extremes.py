@@ -27,7 +27,7 @@ class Steps:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.rows: list[tuple[float, float, np.ndarray]] = []
-        take = watching.Extremes.take_steps
+        take = watching.Extremes.monitor_steps
 
         def spy(extremes: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
             seen = int(extremes.monitor.monitor.count[STAYED])
@@ -457,7 +457,7 @@ def test_extremes_of_a_large_formation_depend_on_no_pause_and_no_sample(monkeypa
 def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, monkeypatch):
     """Another thread, while the flight goes on, or this one, while it waits: the same to the bit."""
     mission = a_sphere(solver)
-    threads, take = set(), watching.Extremes.take_steps
+    threads, take = set(), watching.Extremes.monitor_steps
 
     def spy(*given: Any, **options: Any) -> None:
         threads.add(threading.get_ident())
@@ -468,7 +468,7 @@ def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, mon
         flight = Flight(mission)
         while flight.begin():
             while flight.advance(0.7):
-                flight.contact()
+                flight.deepest_contact()
         return flight.finish()
 
     monkeypatch.setattr(watching.Extremes, "take_steps", spy)
@@ -486,7 +486,7 @@ def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, mon
 
 def test_no_step_is_overwritten_before_it_has_been_watched(monkeypatch):
     """Where the other thread is slow and the flight stops often, to the bit what is found while the flight waits."""
-    mission, take = a_sphere(), watching.Extremes.take_steps
+    mission, take = a_sphere(), watching.Extremes.monitor_steps
     here = threading.get_ident()
 
     def flown() -> list[Any]:
@@ -512,7 +512,7 @@ def test_no_step_is_overwritten_before_it_has_been_watched(monkeypatch):
 
 def test_what_goes_wrong_in_the_thread_that_watches_is_raised(monkeypatch):
     """An error ends the flight; Ctrl-C while it is waited for ends it with what was flown and found."""
-    mission, take = a_sphere(), watching.Extremes.take_steps
+    mission, take = a_sphere(), watching.Extremes.monitor_steps
     here = threading.get_ident()
 
     def fail(*given: Any, **options: Any) -> None:

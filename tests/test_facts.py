@@ -144,7 +144,7 @@ def test_consoles_notebooks_and_pages_show_the_same_rows(what, flights):
         # Names of columns may stand in two lines there, and a repeated heading is not repeated.
         body = rows if table.bare else rows[1:]
         assert len(body) == len(table.rows) > 0
-        for row, cells in zip(body, table.texts, strict=True):
+        for row, cells in zip(body, table.cell_texts, strict=True):
             assert row in lines or plain(" ".join(cells[1:])) in lines, row
     sentences = [part.text for part in sheet.shown_parts if isinstance(part, Line)]
     words = plain(html.unescape(thing._repr_html_().replace("<br>", " ")))
@@ -254,7 +254,7 @@ def test_words_on_a_graph_are_those_of_json(name):
         x for x in ahead.facts().shown_parts if isinstance(x, FactTable) and x.heads[0] == "graph"
     )
     names = [column for column, *_ in table.columns]
-    rows = {row[0]: dict(zip(names, row, strict=True)) for row in table.texts}
+    rows = {row[0]: dict(zip(names, row, strict=True)) for row in table.cell_texts}
     for form, judged in data.items():
         r, row = judged["rigidity"], rows.get(form, {})
         edges, flexes = (
@@ -278,7 +278,7 @@ def numbers_shown(ahead: Any) -> dict[tuple[str, str], list[str]]:
     for table in ahead.facts().shown_parts[1:]:
         if isinstance(table, FactTable) and not table.bare and table.heads[0] != "planned":
             graph = table.heads[0] == "graph"  # of whose words there is a test
-            for row, *cells in table.texts:
+            for row, *cells in table.cell_texts:
                 rest = zip(cells, table.columns[1:], strict=True)
                 text = " ".join(cell for cell, (*_, words) in rest if not (graph and words))
                 numbers = re.findall(r"(?<![\w.])[-\d.][\d.e+-]*", text)
@@ -358,15 +358,18 @@ def test_the_report_of_a_show_has_nothing_of_edges():
 def test_what_applies_to_no_row_is_not_shown():
     """Columns without a value are left out, names of columns with them, and marks where nothing is judged."""
     facts = [Fact("speed", 3.0, "m/s"), Fact("height", 12345.0, "m")]
-    assert table_of_worst_values("what", facts).texts == [["speed", "3 m/s"], ["height", "12345 m"]]
+    assert table_of_worst_values("what", facts).cell_texts == [
+        ["speed", "3 m/s"],
+        ["height", "12345 m"],
+    ]
     assert [name for name, *_ in table_of_worst_values("what", facts).columns] == ["what", "worst"]
     measured = table_of_worst_values(
         "what", [*facts, Fact("tilt", 9.0, "deg", interval=(8.5, 9.25))]
     )
     assert [name for name, *_ in measured.columns] == ["what", "worst", "true value"]
-    assert measured.texts[2] == ["tilt", "9 deg", "8.5 to 9.25"]
+    assert measured.cell_texts[2] == ["tilt", "9 deg", "8.5 to 9.25"]
     judged = table_of_worst_values("what", [*facts, Fact("tilt", 9.0, "deg", 5.0, level="fails")])
-    assert judged.texts[-1] == ["tilt", "9 deg", "<= 5 deg", "FAILED"]
+    assert judged.cell_texts[-1] == ["tilt", "9 deg", "<= 5 deg", "FAILED"]
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.plotting import curves, sketches, space, style
-from rigidfleet.plotting.solids import seen_from_above
+from rigidfleet.plotting.solids import area_from_above
 from rigidfleet.result import LABELS, VARIABLES, PhaseRecord, Result
 from rigidfleet.result.quantities import samples
 from rigidfleet.solids.outline import outline_of_solid
@@ -689,7 +689,7 @@ def test_three_dimensions_have_one_scale(name, flight):
     """A metre is as long in x, y and z: the view is a rotation, cut to two rows, times one scale."""
     figure = drawn(name, a_flight(**FLIGHTS[flight]))
     (ax,) = [ax for ax in figure.axes if ax.name == "3d"]
-    origin, *units = space._on_screen(ax, np.vstack([np.zeros(3), np.eye(3)]))
+    origin, *units = space._screen_positions(ax, np.vstack([np.zeros(3), np.eye(3)]))
     A = np.array(units).T - origin[:, None]
     scale = np.linalg.norm(A[0])
     np.testing.assert_allclose(A @ A.T / scale**2, np.eye(2), atol=1e-6)
@@ -705,7 +705,7 @@ def test_everything_in_space_is_in_the_picture(flight):
     points = np.concatenate(
         [result.position.reshape(-1, 3), *(shape.extent for shape in view.shapes)]
     )
-    inside = space._on_screen(spatial, points) / figure.bbox.size
+    inside = space._screen_positions(spatial, points) / figure.bbox.size
     assert (inside > [0, 0.05]).all()
     assert (inside < [0.62, 0.97]).all()
     flat = above.transData.transform(points[:, :2])
@@ -847,7 +847,7 @@ def test_an_obstacle_seen_from_above_covers_its_hull(name):
         )
         ax.set_ylim(hull.min_bound[1], hull.max_bound[1])
         ax.axis("off")
-        ax.add_patch(PathPatch(seen_from_above(faces), facecolor="black", linewidth=0))
+        ax.add_patch(PathPatch(area_from_above(faces), facecolor="black", linewidth=0))
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         painted = np.mean(1.0 - np.asarray(canvas.buffer_rgba())[..., 0] / 255)

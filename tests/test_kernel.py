@@ -831,9 +831,9 @@ from rigidfleet.kernel.engine import build, objects
 second = subprocess.Popen(objects.build_command("apart"), stdout=subprocess.PIPE)
 if not {helped}:
     second.kill()
-made, monitor_code = [], build.monitor_code
-build.monitor_code = lambda: made.append(1) or monitor_code()
-assert len(build.flight_code(second)) == len(objects.ENTRIES["flight"])
+made, monitor_object_code = [], build.monitor_object_code
+build.monitor_object_code = lambda: made.append(1) or monitor_object_code()
+assert len(build.flight_object_code(second)) == len(objects.ENTRIES["flight"])
 assert len(made) == {int(not helped)}
 """
     environment = os.environ | {"NUMBA_OPT": "0"}
@@ -909,7 +909,7 @@ def test_arrays_have_the_extents_that_the_kernel_is_compiled_for(mission, monkey
     monkeypatch.setattr(packing, "pack_uncached", pack)
     monkeypatch.setattr(native, "pack_uncached", pack)
     packing._last.packed.clear()
-    simulate(mission).evaluate()
+    simulate(mission).compute_lazy_values()
     assert {"Problem", "Workspace", "IntegratorState", "Monitor", "Record", "Segment"} <= seen
 
 

@@ -9,7 +9,7 @@ import pytest
 from rigidfleet.kernel.compiler.simd import (
     as_lanes,
     fill_lanes,
-    pack,
+    pack_lanes,
     rough_inverse,
     total_or_worst,
     unpack,
@@ -21,7 +21,7 @@ VALUES = np.random.default_rng(0).normal(size=(5, 8))
 def test_packing_keeps_every_number():
     """What is packed is unpacked, from arrays of any dimension, at an address that vectors like."""
     for values in (VALUES, VALUES[0], VALUES.reshape(5, 1, 8)):
-        packed = pack(values)
+        packed = pack_lanes(values)
         assert packed.shape == values.shape[:-1]
         assert packed.ctypes.data % 64 == 0
         np.testing.assert_array_equal(unpack(packed), values)
@@ -40,8 +40,8 @@ def test_arithmetic_acts_on_each_lane():
             out[k] = y
 
     a, b = VALUES, VALUES[0] + 3.0
-    out = pack(np.zeros_like(a))
-    formula(pack(a), pack(b[None]), out)
+    out = pack_lanes(np.zeros_like(a))
+    formula(pack_lanes(a), pack_lanes(b[None]), out)
     expected = 0.5 * (2 * a - b + a * b + np.maximum(a, 0.25) * np.maximum(b, a) - abs(a))
     np.testing.assert_allclose(unpack(out), expected, rtol=1e-14, atol=1e-14)
 
@@ -56,8 +56,8 @@ def test_a_number_becomes_a_vector_where_it_meets_one():
             s += a[k]
         out[0], out[1] = s, 1
 
-    out = pack(np.zeros((2, 8)))
-    total(pack(VALUES), out)
+    out = pack_lanes(np.zeros((2, 8)))
+    total(pack_lanes(VALUES), out)
     np.testing.assert_allclose(unpack(out), [VALUES.sum(axis=0), np.ones(8)], atol=1e-15)
 
 
@@ -75,7 +75,7 @@ def test_blocks_are_a_view_of_eight_states_each():
     plain[0] = VALUES.ravel()[:16]
     assert double(plain) == 2
     np.testing.assert_array_equal(plain[1], 2 * plain[0])
-    lanes = pack(np.stack([VALUES, VALUES]))
+    lanes = pack_lanes(np.stack([VALUES, VALUES]))
     assert double(lanes) == 5
     np.testing.assert_array_equal(unpack(lanes)[1], 2 * VALUES)
 
@@ -92,11 +92,11 @@ def test_an_error_is_a_sum_of_one_flight_and_the_worst_of_eight():
         return total_or_worst(squares, x)
 
     assert error(VALUES.ravel()) == pytest.approx((VALUES**2).sum(), rel=1e-14)
-    assert error(pack(VALUES)) == pytest.approx((VALUES**2).sum(axis=0).max(), rel=1e-14)
+    assert error(pack_lanes(VALUES)) == pytest.approx((VALUES**2).sum(axis=0).max(), rel=1e-14)
     for lane in range(8):
         broken = VALUES.copy()
         broken[3, lane] = math.nan
-        assert math.isnan(error(pack(broken)))
+        assert math.isnan(error(pack_lanes(broken)))
 
 
 def test_a_rough_inverse_has_four_digits():

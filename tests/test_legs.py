@@ -15,7 +15,7 @@ from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg, leg_of
 from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.timing import complete_times
-from rigidfleet.preflight.losses import planned_answer
+from rigidfleet.preflight.losses import planned_answer_to_loss
 from rigidfleet.result import Result
 
 STANDING = np.array([[0.0, -2, 1], [0, 2, 1], [3, -2, 1], [3, 2, 1]])
@@ -36,7 +36,7 @@ def planned_legs(mission: Mission, result: Result) -> list[Leg]:
     sure = True
     for k, record in enumerate(result.phases):
         if record.t_start >= first:
-            return [*found[:k], *planned_answer(mission, found[k - 1], found).legs]
+            return [*found[:k], *planned_answer_to_loss(mission, found[k - 1], found).legs]
         if not sure:
             at = int(np.searchsorted(result.time, record.t_start))
             before = found[k - 1].state_at(record.t_start)
@@ -270,7 +270,7 @@ def test_two_hundred_drawn_missions_follow_the_legs_that_their_checks_plan():
     written = Counter(p.kind for mission in missions for p in mission.phases)
     assert min(written.values()) > 10
     assert set(written) == set(KINDS)
-    assert sum(bool(p.automatic) for mission in missions for p in mission.phases) > 100
+    assert sum(bool(p.auto_keys) for mission in missions for p in mission.phases) > 100
     assert sum(not p.flown_as_written for mission in missions for p in mission.phases) > 20
     assert sum(mission.on_loss != "continue" for mission in missions) > 40
 

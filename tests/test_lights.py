@@ -12,7 +12,7 @@ from sample_flights import WORD, bitmap, swarm, word
 
 from rigidfleet import plotting
 from rigidfleet.interchange import FORMATS, export
-from rigidfleet.result.lights import lights, plane_view, view_angles
+from rigidfleet.result.lights import angles_facing_formation, light_colours, plane_view
 from rigidfleet.web.replay import replay_page
 
 AMBER = np.array([255, 176, 0]) / 255
@@ -41,7 +41,7 @@ def amber(picture):
 
 def test_lights_fade_with_the_blend(flight):
     """Light is white, turns amber while the formation is taken, and stays; each vehicle has its own."""
-    shown = lights(flight, np.array([0.0, 0.25, 0.5, 1.0, 3.0]))
+    shown = light_colours(flight, np.array([0.0, 0.25, 0.5, 1.0, 3.0]))
     share = np.array([0.0, 0.25, 0.5, 1.0, 1.0])[:, None, None]
     np.testing.assert_allclose(
         shown, np.broadcast_to(1 + share * (AMBER - 1), shown.shape), atol=1e-9
@@ -108,7 +108,7 @@ def test_the_viewer_turns_with_the_formation():
     turned = made.position @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     half = math.sqrt(0.5)
     attitude = np.tile([half, 0, 0, half], (len(made.time), 1))
-    azimuth, _ = view_angles(replace(made, position=turned, attitude=attitude))
+    azimuth, _ = angles_facing_formation(replace(made, position=turned, attitude=attitude))
     assert math.degrees(azimuth) == pytest.approx(0.0, abs=1.0)
 
 
@@ -121,7 +121,7 @@ def test_the_page_has_lights(flight):
     assert math.degrees(info["azimuth"]) == pytest.approx(-90, abs=0.1)
     time = info["start"] + info["step"] * np.arange(info["count"])
     shown = columns["light"].reshape(len(time), -1, 3)
-    np.testing.assert_allclose(shown[:, 7], lights(flight, time)[:, 7], atol=1 / 255)
+    np.testing.assert_allclose(shown[:, 7], light_colours(flight, time)[:, 7], atol=1 / 255)
 
 
 def test_gltf_shines(flight, tmp_path):

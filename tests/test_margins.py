@@ -15,7 +15,7 @@ from rigidfleet.math.margins import (
     LoopGains,
     formation_loops,
     is_stable,
-    largest_pole,
+    largest_stable_pole,
     stability_margins,
     tracking_loops,
 )
@@ -95,8 +95,8 @@ def test_triple_pole_with_a_lag(tau):
     r = np.array([[0.0, 0, 1], [0, 0, -1]])
     law = LoopGains(solver="exact")
     loops = formation_loops(r, [[0, 1]], [1.0, 2.0], law, [Lag(1.0, 5.0, tau)] * 2)
-    (held,) = [loop for loop in loops if loop.is_constrained]
-    assert largest_pole([held], law) == pytest.approx(8 / (9 * tau), rel=1e-3)
+    (held,) = [loop for loop in loops if loop.has_constraint_law]
+    assert largest_stable_pole([held], law) == pytest.approx(8 / (9 * tau), rel=1e-3)
 
 
 @pytest.mark.parametrize("k", [0.5, 1.0])
@@ -110,7 +110,7 @@ def test_weak_shapes_without_tracking(k):
     assert 0.05 < sigma < 1 / 9
     loops = formation_loops(r, edges, np.ones(3), law, [Lag(point=True)] * 3)
     expected = 3 * k * (1 - sigma) / (1 - 9 * sigma)
-    assert largest_pole(loops, law) == pytest.approx(expected, rel=3e-3)
+    assert largest_stable_pole(loops, law) == pytest.approx(expected, rel=3e-3)
 
 
 @pytest.mark.parametrize("lag", [LIGHT, HEAVY])
@@ -123,7 +123,7 @@ def test_margins_are_those_of_python_control(lag, delay, constrained):
         # Side by side, a distance holds horizontal motion alone.
         r = np.array([[1.0, 0, 0], [-1, 0, 0]])
         loops = formation_loops(r, [[0, 1]], [1, 1], law, [delayed(lag, delay)] * 2)
-        loops = [loop for loop in loops if loop.is_constrained]
+        loops = [loop for loop in loops if loop.has_constraint_law]
         pid = [2 * law.alpha, law.beta**2, law.gamma]
     else:
         loops = [x for x in tracking_loops([delayed(lag, delay)]) if not x.channels[0][1]]
@@ -181,7 +181,9 @@ def test_heading_does_not_matter_but_attitude_does():
     law, lags = LoopGains(), [delayed(HEAVY, 0.03)] * 2
     heading = np.array([math.cos(0.7), math.sin(0.7), 0.0])
     along, turned, tilted, upright = (
-        largest_pole(formation_loops(np.array([axis, -axis]), [[0, 1]], np.ones(2), law, lags), law)
+        largest_stable_pole(
+            formation_loops(np.array([axis, -axis]), [[0, 1]], np.ones(2), law, lags), law
+        )
         for axis in (np.eye(3)[0], heading, (heading + np.eye(3)[2]) / math.sqrt(2), np.eye(3)[2])
     )
     assert turned == pytest.approx(along, rel=1e-9)
@@ -286,9 +288,9 @@ def test_flights_are_stable_up_to_the_computed_pole(r, masses, lags, law):
     fleet = [delayed(lags[i % len(lags)], 0.02 + 0.01 * (i % len(lags)), rate) for i in range(n)]
     law = LoopGains(**law)
     loops = formation_loops(r, edges, m, law, fleet)
-    p = largest_pole(loops, law)
+    p = largest_stable_pole(loops, law)
     for share in (0.97, 1.03):
-        some = law.with_pole(share * p)
+        some = law.with_triple_pole(share * p)
         assert is_stable(loops, some) == (share < 1)
         assert Flight(r, edges, m, some, fleet, rate).grows() == (share > 1)
 
@@ -310,7 +312,7 @@ def test_an_attitude_that_is_unstable_by_itself():
     lag = Lag(k_R=500.0, k_omega=20.0, tau=0.05)
     assert not lag.stable
     assert not stability_margins(tracking_loops([lag]), LoopGains()).stable
-    assert largest_pole(tracking_loops([lag]), LoopGains()) == 0.0
+    assert largest_stable_pole(tracking_loops([lag]), LoopGains()) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.vehicles import TickTables, YawTurn, network_of, sampled_flight
-from rigidfleet.plotting.messages import oldest_messages
+from rigidfleet.plotting.messages import oldest_message_ages
 from rigidfleet.typing import Floats
 from rigidfleet.web.live.session import Session
 from rigidfleet.web.replay.scene import page_samples
@@ -380,7 +380,7 @@ def test_a_result_has_what_its_links_did():
     np.testing.assert_allclose(silent[out, edge], np.minimum((result.time[out] - 3.98) / 0.5, 1.0))
     words = " ".join(rf.assess(result).notes)
     assert "edges that let go for want of messages, first at 4.50 s: 1-2." in words + "."
-    oldest = oldest_messages(result)
+    oldest = oldest_message_ages(result)
     assert oldest[out, 0].min() > oldest[out, 2].max()
 
 

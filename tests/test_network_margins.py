@@ -368,7 +368,7 @@ def test_check_says_what_the_network_is_beside_what_is_borne():
     (table,) = (
         x for x in cube.facts().shown_parts if isinstance(x, FactTable) and x.heads[0] == "network"
     )
-    (row,) = (dict(zip(table.heads, texts, strict=False)) for texts in table.texts)
+    (row,) = (dict(zip(table.heads, texts, strict=False)) for texts in table.cell_texts)
     assert (row["network"], row["broadcasts [/s]"]) == ("cube", "400")
     assert (row["has [ms]"], row["has [%]"]) == ("60", "30")
     data = cube.data()["network"]["cube"]

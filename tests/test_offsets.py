@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import expm
 
 from rigidfleet.assessment import assess
-from rigidfleet.math.pid import exponential
+from rigidfleet.math.pid import matrix_exponential
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import MODELS
 from rigidfleet.preflight.check import check
@@ -245,7 +245,7 @@ def test_exponentials_are_those_of_scipy(size):
     A = size * np.random.default_rng(1).normal(size=(5, 4, 4))
     want = expm(A)
     np.testing.assert_allclose(
-        exponential(A, np.ones(5)), want, rtol=1e-11, atol=1e-12 * np.abs(want).max()
+        matrix_exponential(A, np.ones(5)), want, rtol=1e-11, atol=1e-12 * np.abs(want).max()
     )
 
 

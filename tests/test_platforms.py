@@ -171,4 +171,4 @@ def test_a_drive_that_is_not_there(monkeypatch):
     monkeypatch.setattr(os.path, "lexists", lambda _: False)
     monkeypatch.setattr(outputs, "TemporaryFile", refuse)
     with pytest.raises(ResultError, match="the system cannot find the path"):
-        outputs.Files(Path("Z:/flights/a"), "a").test_folder()
+        outputs.Files(Path("Z:/flights/a"), "a").check_folder_writable()

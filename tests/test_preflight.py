@@ -14,7 +14,7 @@ from rigidfleet.formation.shapes import slots
 from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.planning.preview import preview_phases
-from rigidfleet.plotting.graph import formation_graphs
+from rigidfleet.plotting.graph import formation_graphs_figure
 from rigidfleet.preflight.check import check
 from rigidfleet.preflight.formations import STARTS
 from rigidfleet.simulation.flight import simulate
@@ -358,12 +358,12 @@ def test_figure_shows_flexes_and_redundant_edges():
     phases = [{"kind": "establish", "formation": "square", "until": 5.0}]
     whole = mission(phases=phases)
     judged = {f.name: f.rigidity for f in check(whole).formations}
-    (ax,) = formation_graphs(whole, judged).axes
+    (ax,) = formation_graphs_figure(whole, judged).axes
     assert {line.get_linestyle() for line in ax.lines if "edge" in str(line.get_gid())} == {"--"}
     assert any("flex-1" in gid for gid in arrows(ax))
     triangle = load_mission("single-waypoint")
     judged = {f.name: f.rigidity for f in check(triangle).formations}
-    (ax,) = formation_graphs(triangle, judged).axes
+    (ax,) = formation_graphs_figure(triangle, judged).axes
     assert {line.get_linestyle() for line in ax.lines if "edge" in str(line.get_gid())} == {"-"}
     assert not arrows(ax)
 

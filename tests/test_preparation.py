@@ -165,7 +165,7 @@ def test_what_a_flight_makes_later_is_what_it_would_have_made_at_once(given, con
     whole = asked_for(first, names)
     assert simulate("establish-cube").thrust.any()
     pickled, copied = pickle.loads(pickle.dumps(second)), copy.copy(second)
-    ready = vars(copy.copy(second).evaluate())
+    ready = vars(copy.copy(second).compute_lazy_values())
     assert whole.keys() | {"mission_text"} <= ready.keys()
     with ThreadPoolExecutor(2) as pool:
         both = [pool.submit(asked_for, third, order) for order in (names, names[::-1])]
@@ -266,5 +266,5 @@ def test_a_copy_of_what_is_packed_has_the_addresses_of_its_own_arrays():
     result = simulate(load_mission("square"))
     other = copy.deepcopy(result)
     np.testing.assert_array_equal(
-        other.evaluate().constraint_force, result.evaluate().constraint_force
+        other.compute_lazy_values().constraint_force, result.compute_lazy_values().constraint_force
     )

@@ -274,9 +274,9 @@ def test_a_sample_just_beside_another_shows_no_rounding(beside):
     )
     result = simulate(mission)
     assert np.abs(np.diff(result.time) - abs(beside)).min() < 1e-9
-    jerk = result.motion(flown=True).state[:, 3]
-    assert np.abs(jerk - result.motion().state[:, 3]).max() < 0.2
-    acceleration = result.motion().state[:, 2]
+    jerk = result.setpoints_at_samples(flown=True).state[:, 3]
+    assert np.abs(jerk - result.setpoints_at_samples().state[:, 3]).max() < 0.2
+    acceleration = result.setpoints_at_samples().state[:, 2]
     worst = {check.check: check.worst for check in assess(result).checks}
     up = np.abs(acceleration[..., 2]).max()
     along = np.hypot(acceleration[..., 0], acceleration[..., 1]).max()

@@ -88,7 +88,7 @@ def test_a_path_leads_to_what_the_document_has():
         "constraint.solver = grid(exact)",
         runs=None,
     )
-    document = found.varied(0)
+    document = found.document_of_run(0)
     mission = Mission.from_dict(document)
     assert mission.agents.position == ((0.0, 0.0, 5.0), (3.0, 1.0, 7.0))
     assert mission.agents.mass == (3.0, 1.0)
@@ -120,7 +120,7 @@ def test_a_run_is_the_mission_that_its_data_give(name, line):
             return str(error), None
 
     for k in range(40):
-        alone = json.loads(json.dumps(found.varied(k)))
+        alone = json.loads(json.dumps(found.document_of_run(k)))
         run = outcome(lambda k=k: found.mission_of(k))
         assert run == outcome(lambda k=k, data=alone: Mission.from_plain(data, f"run {k}"))
         refused.append(bool(run[0]))
@@ -131,19 +131,19 @@ def test_a_run_is_the_mission_that_its_data_give(name, line):
 
 def test_a_star_gives_each_its_own_and_no_star_all_the_same():
     """`agents.mass.*` draws a mass for each vehicle, `agents.mass` one for all."""
-    own = sweep("agents.mass.* = uniform(1, 2)").varied(0)["agents"]["mass"]
+    own = sweep("agents.mass.* = uniform(1, 2)").document_of_run(0)["agents"]["mass"]
     assert own[0] != own[1]
-    assert sweep("agents.mass = uniform(1, 2)").varied(0)["agents"]["mass"] != 1.0
-    shifted = sweep("agents.position.*.3 += uniform(1, 2)", "agents.position.1 += grid(1)").varied(
-        0
-    )
+    assert sweep("agents.mass = uniform(1, 2)").document_of_run(0)["agents"]["mass"] != 1.0
+    shifted = sweep(
+        "agents.position.*.3 += uniform(1, 2)", "agents.position.1 += grid(1)"
+    ).document_of_run(0)
     assert shifted["agents"]["position"][0][:2] == [1.0, 1.0]
 
 
 def test_whole_numbers_stay_whole():
     """A number that the mission counts with is rounded."""
     drawn = sweep("constraint.iterations = uniform(1, 9)", runs=40)
-    found = {drawn.varied(k)["constraint"]["iterations"] for k in range(40)}
+    found = {drawn.document_of_run(k)["constraint"]["iterations"] for k in range(40)}
     assert found == set(range(1, 10))
 
 
@@ -166,7 +166,7 @@ def test_choices_are_as_likely():
     found = sweep("constraint.solver = choice(iterated, exact, pinv)", runs=900)
     words = [found.values(k)[0] for k in range(900)]
     assert stats.chisquare([words.count(w) for w in ("iterated", "exact", "pinv")]).pvalue > 0.01
-    assert found.varied(0)["constraint"]["solver"] == words[0]
+    assert found.document_of_run(0)["constraint"]["solver"] == words[0]
 
 
 def test_columns_and_runs_are_independent():
@@ -293,7 +293,9 @@ def test_metrics_are_those_of_the_verdict(tmp_path):
 
     found = sweep(runs=3)
     row = fly_runs(found, range(3))[2]
-    result = simulate_together([Mission.from_dict(found.varied(run)) for run in range(3)])[2]
+    result = simulate_together([Mission.from_dict(found.document_of_run(run)) for run in range(3)])[
+        2
+    ]
     verdict = assess(result)
     assert list(row.metrics) == list(METRICS)
     assert row.passed == verdict.passed
@@ -329,7 +331,7 @@ def test_a_way_is_searched_once_where_nothing_that_varies_matters_to_it(
     varied = Sweep.of(FOUND, [line])
     rows = fly_runs(varied, range(2))
     assert count[0] == searches
-    alone = simulate_together([Mission.from_dict(varied.varied(k)) for k in range(2)])
+    alone = simulate_together([Mission.from_dict(varied.document_of_run(k)) for k in range(2)])
     assert count[0] == searches + 2
     for row, result in zip(rows, alone, strict=True):
         own = measure_metrics(result, assess(result))
@@ -518,7 +520,7 @@ def test_ends_are_those_of_whole_flights(ends):
     whole = Sweep.of(Mission.from_dict(TETRAHEDRON), STARTS, runs=20, seed=3)
     values = [whole.values(run) for run in range(20)]
     for k, (r, v) in enumerate(zip(*start_states(whole, values), strict=True)):
-        agents = Mission.from_dict(whole.varied(k)).agents
+        agents = Mission.from_dict(whole.document_of_run(k)).agents
         assert (np.array(agents.position) == r).all()
         assert (np.array(agents.velocity) == v).all()
     rows = fly_runs(whole, range(20))
@@ -1528,7 +1530,7 @@ def test_runs_share_random_numbers_or_have_their_own(tmp_path):
 
     def seeds(*vary: str, **keys: Any) -> list[tuple[int, int]]:
         found = Sweep.of(mission, ["agents.mass *= grid(1, 1, 1, 1)", *vary], seed=5, **keys)
-        tables = [found.varied(k)["disturbances"] for k in range(4)]
+        tables = [found.document_of_run(k)["disturbances"] for k in range(4)]
         assert found.mission.disturbances is not None
         assert Sweep.from_json(found.json()).identity == found.identity
         return [(t["noise"]["seed"], t["gusts"].get("seed", 0)) for t in tables]
@@ -1543,7 +1545,7 @@ def test_runs_share_random_numbers_or_have_their_own(tmp_path):
     assert varied == [(9, b) for _, b in own]
     assert "random_numbers" not in json.loads(Sweep.of(mission, SCATTER, runs=2).json())
     calm = Sweep.of(MISSION, SCATTER, runs=2, random_numbers="own")
-    assert "disturbances" not in calm.varied(0)
+    assert "disturbances" not in calm.document_of_run(0)
     for keys, word in (({}, "shared"), ({"random_numbers": "own"}, "own")):
         table = fly(Sweep.of(mission, ["agents.mass *= grid(1, 1)"], **keys), tmp_path / word)
         assert summarise(table).random_numbers == word

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from rigidfleet.assessment import assess
-from rigidfleet.kernel.compiler.simd import empty, pack, unpack
+from rigidfleet.kernel.compiler.simd import empty_lanes, pack_lanes, unpack
 from rigidfleet.kernel.engine import batch, codegen, lane_steps, native
-from rigidfleet.kernel.engine.tracer import Code, FlightTrace, UnfitError, numbers
-from rigidfleet.kernel.gauge import write_force_gauge
+from rigidfleet.kernel.engine.tracer import Code, FlightTrace, UnfitError, varying_numbers
+from rigidfleet.kernel.gauge import write_watched_forces
 from rigidfleet.kernel.problem import Problem, workspace
 from rigidfleet.kernel.records import FIRST_ROW, TRAILED
 from rigidfleet.mission import Mission, load_mission
@@ -192,7 +192,7 @@ def kernel(p: Problem, y: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]
     n, m = len(p.vehicles.m), len(p.graph.edges)
     w, dy, values = workspace(n, m, solver=p.law.solver), np.empty_like(y), np.empty(5 * n + 2 * m)
     native.closed_loop(t, y, dy, p, w)
-    write_force_gauge(p, w, values)
+    write_watched_forces(p, w, values)
     return dy, values
 
 
@@ -225,10 +225,10 @@ def test_the_code_of_eight_problems_is_the_kernel(name: str, phase: int):
         flight.begin()
         plans.append((flight.plan, flight.plan.initial_state()))
     problems = [plan.problem for plan, _ in plans]
-    assert batch.fit_together(problems)
+    assert batch.can_unroll_together(problems)
     begin, end = plans[0][0].start, plans[0][0].t_end
     ready = codegen.unrolled_together(
-        problems, codegen.tables_of([p.disturbance for p in problems])
+        problems, codegen.gust_and_noise_tables([p.disturbance for p in problems])
     )
     random = np.random.default_rng(0)
     middle = 0.7 * begin + 0.3 * end
@@ -236,8 +236,8 @@ def test_the_code_of_eight_problems_is_the_kernel(name: str, phase: int):
     for t, stage in ((begin, 0), (middle, 0), (middle, lane_steps.STAGES - 1), (end, 0)):
         ready.stage[0] = stage
         y = np.array([state + 0.1 * random.normal(size=state.size) for _, state in plans])
-        dy = pack(np.zeros_like(y.T))
-        call(ready, pack(y.T), dy, t)
+        dy = pack_lanes(np.zeros_like(y.T))
+        call(ready, pack_lanes(y.T), dy, t)
         n = len(problems[0].vehicles.m)
         for lane, p in enumerate(problems):
             expected, forces = kernel(p, y[lane], t)
@@ -256,7 +256,7 @@ def test_problems_that_branch_differently_share_no_code():
         flight.begin()
         p = flight.plan.problem
         problems.append(p._replace(law=p.law._replace(k_def=0.0)) if k == 3 else p)
-    assert batch.fit_together(problems)
+    assert batch.can_unroll_together(problems)
     with pytest.raises(UnfitError):
         codegen.unrolled_together(problems, {})
 
@@ -267,14 +267,14 @@ def test_arrays_of_eight_flights_become_lanes():
     made = codegen.packed(parts)
     for k, part in enumerate(parts):
         np.testing.assert_array_equal(unpack(made)[..., k], part)
-    assert empty((3, 2)).ctypes.data % 64 == 0
+    assert empty_lanes((3, 2)).ctypes.data % 64 == 0
 
 
 def test_each_flight_side_by_side_has_its_own_trail(monkeypatch):
     """The steps of a trail join, and end where its flight is when it flies alone, in wind and noise."""
     missions = varied("windy-passage", windy)
     ends: dict[int, list[np.ndarray]] = {}
-    take = Extremes.take_steps
+    take = Extremes.monitor_steps
 
     def kept(self: Extremes, problem: Any, work: Any, state: Any, *, last: bool) -> None:
         rows = (state.count[FIRST_ROW] + np.arange(state.count[TRAILED])) % len(state.trail.clock)
@@ -306,7 +306,7 @@ def test_components_that_do_not_move_are_left_out():
     for _ in range(9):
         flight.begin()
         p = flight.plan.problem
-        values = numbers([p])
+        values = varying_numbers([p])
         moves = np.abs(p.motion.coefficients).max(axis=(0, 2)) > 0.0
         sizes.append(len(Code(FlightTrace(p, values, moves.tolist())).moment))
         flight.advance()

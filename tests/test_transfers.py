@@ -8,7 +8,7 @@ from scipy.interpolate import BSpline
 from scipy.spatial.distance import pdist
 
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.planning.certificate import CLOSE, of_ways
+from rigidfleet.planning.certificate import CLOSE, prove_ways
 from rigidfleet.planning.transfers import Transfer, least_duration, plan_transfer
 
 BOX = ((-1.5, -1.5, 0.2), (1.5, 1.5, 2.2))
@@ -68,7 +68,7 @@ def test_a_certificate_of_bent_ways_is_a_tight_lower_bound():
     rng = np.random.default_rng(3)
     knots = np.array([0.0, 0.7, 2.0, 3.1])
     ways = rng.normal(size=(3, 5, 3, 6)) * [3.0, 2.0, 1.0, 0.5, 0.2, 0.1]
-    proof = of_ways(knots, ways, np.full(5, 0.1))
+    proof = prove_ways(knots, ways, np.full(5, 0.1))
     least = np.inf
     for k, h in enumerate(np.diff(knots)):
         x = np.einsum("nqp,tp->tnq", ways[k], np.linspace(0, h, 40_001)[:, None] ** np.arange(6))
@@ -92,7 +92,7 @@ def test_vehicles_that_keep_their_distance_need_no_search():
     v = np.stack(
         [np.stack([-np.sin(time + a), np.cos(time + a), 0 * time], 1) for a in (0.0, np.pi)], 1
     )
-    proof = of_ways(*Piecewise.hermite(time, np.stack([x, v, -x, -v])))
+    proof = prove_ways(*Piecewise.hermite(time, np.stack([x, v, -x, -v])))
     assert 2.0 - 2 * CLOSE <= proof.separation <= 2.0
 
 

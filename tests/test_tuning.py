@@ -137,9 +137,9 @@ def test_gains_that_act_are_tuned():
 def test_space_holds_the_own_gains():
     """The start is the mission's own gains; the ends are as far as the box reaches."""
     space = GainSpace({"constraint.alpha": 3.0, "tracking.Q.1": 4.0})
-    assert space.gains_at(space.own_point) == space.own
+    assert space.gains_at(space.mission_point) == space.own
     odd = GainSpace({"constraint.beta": math.sqrt(12)})
-    assert odd.gains_at(odd.own_point) == odd.own
+    assert odd.gains_at(odd.mission_point) == odd.own
     assert space.gains_at([0.0, 0.0]) == {"constraint.alpha": 0.75, "tracking.Q.1": 0.25}
     assert space.gains_at([1.0, 1.0]) == {"constraint.alpha": 12.0, "tracking.Q.1": 64.0}
 
@@ -217,7 +217,7 @@ def test_study(study):
     assert told[-1].done == tuned.flights + 2 * SMALL["validation"]
     rows = [read(f) for f in sorted((folder / "rounds").iterdir())]
     assert sum(len(table.run) for table in rows) == tuned.flights
-    flown = [t.sweep.varied(k) for t in rows for k in range(t.sweep.runs)]
+    flown = [t.sweep.document_of_run(k) for t in rows for k in range(t.sweep.runs)]
     assert {document["disturbances"]["noise"]["seed"] for document in flown} == {0, 1}
     errors = [t.metrics["shape_tracked"].reshape(-1, 2).mean(axis=1).min() for t in rows]
     passed = [t.passed.reshape(-1, 2).sum(axis=1).max() for t in rows]

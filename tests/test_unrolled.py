@@ -6,9 +6,15 @@ import numba
 import numpy as np
 import pytest
 
-from rigidfleet.kernel.compiler.simd import pack, unpack
+from rigidfleet.kernel.compiler.simd import pack_lanes, unpack
 from rigidfleet.kernel.engine import codegen, lane_steps, native
-from rigidfleet.kernel.engine.tracer import Code, Trace, UnfitError, elimination_order, structure
+from rigidfleet.kernel.engine.tracer import (
+    Code,
+    Trace,
+    UnfitError,
+    code_structure,
+    elimination_order,
+)
 from rigidfleet.kernel.problem import Problem, workspace
 from rigidfleet.mission import Mission
 from rigidfleet.planning.legs import leg_of
@@ -76,9 +82,9 @@ def call(p, y, dy, t):
 def in_lanes(p: Problem, y: np.ndarray, t: float) -> np.ndarray:
     """dy/dt (8, n) of states y (8, n); the code leaves out positions, whose derivatives are velocities."""
     ready = codegen.unrolled(p)
-    before = pack(np.repeat(p.reference.d0[:, None], 8, axis=1))
-    dy = pack(np.zeros_like(y.T))
-    call(ready._replace(before=before), pack(y.T), dy, t)
+    before = pack_lanes(np.repeat(p.reference.d0[:, None], 8, axis=1))
+    dy = pack_lanes(np.zeros_like(y.T))
+    call(ready._replace(before=before), pack_lanes(y.T), dy, t)
     found, coordinates = unpack(dy).T, 3 * len(p.vehicles.m)
     assert not found[:, :coordinates].any()
     found[:, :coordinates] = y[:, coordinates : 2 * coordinates]
@@ -114,10 +120,10 @@ def test_other_numbers_need_no_other_code():
     """Another gain or mass flies by the same code; numbers that become equal do not."""
     p, _ = make(*CASES["the default law"])
     law = p.law._replace(alpha=1.7 * p.law.alpha)
-    assert structure(p)[0] == structure(p._replace(law=law))[0]
+    assert code_structure(p)[0] == code_structure(p._replace(law=law))[0]
     law = p.law._replace(alpha=p.law.beta)
-    assert structure(p)[0] != structure(p._replace(law=law))[0]
-    assert structure(p)[0] != structure(p._replace(law=p.law._replace(k_def=0.0)))[0]
+    assert code_structure(p)[0] != code_structure(p._replace(law=law))[0]
+    assert code_structure(p)[0] != code_structure(p._replace(law=p.law._replace(k_def=0.0)))[0]
 
 
 def test_a_state_without_multipliers_has_no_derivative():

@@ -9,7 +9,7 @@ import pytest
 from sample_missions import three_quadrotors
 
 import rigidfleet as rf
-from rigidfleet._common.text import percent
+from rigidfleet._common.text import percent_text
 from rigidfleet.kernel import control, references
 from rigidfleet.kernel.problem import workspace
 from rigidfleet.math import attitude as att
@@ -468,7 +468,7 @@ def test_check_knows_the_integral_of_the_tracking(integral):
 )
 def test_shares_in_per_cent(share, words):
     """Shares are told without powers of ten."""
-    assert percent(share) == words
+    assert percent_text(share) == words
 
 
 @pytest.mark.parametrize("kind", ["formation", "fixed", "along"])

@@ -13,9 +13,9 @@ from rigidfleet.math import proximity
 from rigidfleet.math.attitude import dcm_from_rotation_vector
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning import ways
-from rigidfleet.planning.clearance import closest, greatest_speeds, speed_bounds
+from rigidfleet.planning.clearance import clearance_to, greatest_speeds, speed_bounds
 from rigidfleet.planning.derivatives import slot_derivatives
-from rigidfleet.planning.lattice import FreeSpace, keeps_room
+from rigidfleet.planning.lattice import FreeSpace, is_clear
 from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.timing import complete_times, expand_mission
 from rigidfleet.simulation.flight import Flight
@@ -284,7 +284,7 @@ def test_the_least_clearance_is_between_samples():
     data["phases"][1] = {"kind": "fly", "position": [12, 0, 8], "duration": 4.0}
     mission = Mission.from_dict(data)
     planned = preview_phases(mission)[0][1]
-    found = closest(planned, mission.obstacles[0], mission.fleet.radius, speed_bounds(planned))
+    found = clearance_to(planned, mission.obstacles[0], mission.fleet.radius, speed_bounds(planned))
     t = np.linspace(planned.time[0], planned.time[-1], 40001)
     r = slot_derivatives(planned.leg.reference, planned.leg.motion, t, 1)[:, 0]
     out = np.maximum(np.maximum([-0.001, -1, 0] - r, r - [0.001, 1, 7.0]), 0.0)
@@ -311,7 +311,7 @@ def test_the_least_clearance_of_many_is_between_samples(at_once, monkeypatch):
     monkeypatch.setattr("rigidfleet.planning.clearance._AT_ONCE", at_once)
     mission = past_a_ball(1000)
     planned = preview_phases(mission)[0][0]
-    found = closest(planned, mission.obstacles[0], mission.fleet.radius, speed_bounds(planned))
+    found = clearance_to(planned, mission.obstacles[0], mission.fleet.radius, speed_bounds(planned))
     assert found.proved == found.clearance - 1e-3
     t = np.linspace(found.time - 0.3, found.time + 0.3, 6001)
     near = slot_derivatives(planned.leg.reference, planned.leg.motion, t, 1)[:, 0, found.agent]
@@ -329,7 +329,7 @@ def test_what_a_check_has_no_time_to_prove_is_told(monkeypatch):
     monkeypatch.setattr("rigidfleet.planning.clearance._IN_ALL", 10_000)
     mission = past_a_ball(1000)
     planned = preview_phases(mission)[0][0]
-    found = closest(planned, mission.obstacles[0], mission.fleet.radius, speed_bounds(planned))
+    found = clearance_to(planned, mission.obstacles[0], mission.fleet.radius, speed_bounds(planned))
     t = np.linspace(planned.time[0], planned.time[-1], 4001)
     r = slot_derivatives(planned.leg.reference, planned.leg.motion, t, 1)[:, 0]
     dense = float(np.linalg.norm(r - [300.31, 0.43, 10.07], axis=-1).min()) - 0.12
@@ -350,9 +350,9 @@ def test_a_fence_is_compared_exactly():
     looks = []
 
     class Counting(FreeSpace):
-        def room_to_obstacles(self, r, radius, most):
+        def clearance_to_obstacles(self, r, radius, most):
             looks.append(len(r))
-            return super().room_to_obstacles(r, radius, most)
+            return super().clearance_to_obstacles(r, radius, most)
 
     space, radius, need = Counting([], fence), np.full(3, 0.1), 0.2
     share = np.linspace(0.0, 1.0, 2001)
@@ -371,7 +371,7 @@ def test_a_fence_is_compared_exactly():
         centres = a[:, None, None] + share[:, None, None] * (b - a)[:, None, None] + path(share)
         room = np.minimum(centres - fence[0], fence[1] - centres).min(axis=(1, 2, 3))
         looks.clear()
-        kept = keeps_room(space, a, b, path, ways, radius, need)
+        kept = is_clear(space, a, b, path, ways, radius, need)
         assert 0 < kept.sum() < len(kept)
         assert not (kept & (room < need)).any()
         assert kept[room > need + float(ways.max()) / 4000].all()

@@ -84,13 +84,13 @@ def constraint_force(
         raise ValueError(f"unknown solver {solver!r}; choose one of {', '.join(SOLVERS)}")
     w = workspace(n, e)
     w.d[:], w.d_dot[:], w.d_ddot[:] = d, d_dot, d_ddot
-    v, f = _expand(v, (n, 3), "v"), _expand(f_E, (n, 3), "f_E")
+    v, f = _broadcast(v, (n, 3), "v"), _broadcast(f_E, (n, 3), "f_E")
     law = ConstraintLaw(
         float(alpha), float(beta), float(gamma), SOLVERS[solver], float(damping), int(iterations),
         float(threshold), float(cutoff), 0.0,
     )  # fmt: skip
     a = np.ascontiguousarray(f / m[:, None])
-    constraint.right_side(r, v, _expand(integral, (e,), "integral"), a, graph.edges, law, w)
+    constraint.right_side(r, v, _broadcast(integral, (e,), "integral"), a, graph.edges, law, w)
     if e and not w.L.min() > 0.0:
         i, j = graph.edges[w.L.argmin()]
         raise ValueError(f"agents {i} and {j} coincide: their edge has no direction")
@@ -137,7 +137,7 @@ def allocate(
     rigid_body.inertia_inverse(w.I, w.I_inv)
     f = np.zeros((n, 3))
     rigid_body.allocate(
-        x, m, m.sum(), _expand(F, (3,), "F"), _expand(tau, (3,), "tau"), _expand(omega, (3,), "omega"),
+        x, m, m.sum(), _broadcast(F, (3,), "F"), _broadcast(tau, (3,), "tau"), _broadcast(omega, (3,), "omega"),
         RIGID if method == "rigid" else SPLITS[torque_split], w.I, w.I_inv, f, w.H, w.H_V, w.H_w,
     )  # fmt: skip
     return f
@@ -146,7 +146,7 @@ def allocate(
 def wrench(x: ArrayLike, masses: ArrayLike, f: ArrayLike) -> Floats:
     """Wrench (6,) of forces f (N, 3) [N] at x (N, 3) [m]: sum, Eq. (24), and torque about the CM, Eq. (25) [N, N m]."""
     m, x = _check_masses_and_points(masses, x)
-    f = _expand(f, x.shape, "f")
+    f = _broadcast(f, x.shape, "f")
     return np.concatenate([f.sum(axis=0), np.cross(about_cm(x, m), f).sum(axis=0)])
 
 
@@ -169,7 +169,7 @@ def shape_schedule(
     p0 = np.ascontiguousarray(p0, dtype=float)
     m = np.ones(len(p0)) if masses is None else masses
     m, p0 = _check_masses_and_points(m, p0)
-    p1 = _expand(p1, p0.shape, "p1")
+    p1 = _broadcast(p1, p0.shape, "p1")
     dp = align_slots(about_cm(p0, m), about_cm(p1, m), m)[0] if align else p1 - p0
     zero = np.zeros(0)
     ref = Reference(SHAPE, float(start), float(blend), zero, zero, p0, dp, np.zeros(3))
@@ -184,7 +184,7 @@ def distance_schedule(
     d = sqrt(d0^2 + (d1^2 - d0^2) s): realisable throughout for up to four agents.
     """
     d0 = np.atleast_1d(np.asarray(d0, dtype=float))
-    d1 = _expand(d1, d0.shape, "d1")
+    d1 = _broadcast(d1, d0.shape, "d1")
     none = np.zeros((0, 3))
     ref = Reference(SQUARED, float(start), float(blend), d0, d1, none, none, np.zeros(3))
     return _schedule(ref, np.zeros((len(d0), 2), dtype=np.int64), times)
@@ -205,13 +205,13 @@ def _check_masses_and_points(masses: ArrayLike, points: ArrayLike) -> tuple[Floa
     r = np.array(points, dtype=float, order="C")
     if r.ndim != 2 or r.shape[1] != 3:
         raise ValueError(f"positions must be (N, 3), not {r.shape}")
-    m = _expand(masses, (len(r),), "masses")
+    m = _broadcast(masses, (len(r),), "masses")
     if not (m > 0).all():
         raise ValueError("masses must be positive [kg]")
     return m, r
 
 
-def _expand(value: ArrayLike, shape: tuple[int, ...], name: str) -> Floats:
+def _broadcast(value: ArrayLike, shape: tuple[int, ...], name: str) -> Floats:
     try:
         # A copy: a read-only view has another type, and would compile the call again.
         return np.array(np.broadcast_to(np.asarray(value, dtype=float), shape), order="C")

@@ -101,32 +101,32 @@ class FactTable:
     @property
     def columns(self) -> list[tuple[str, str, bool]]:
         """Name and unit of each column that is shown, and whether it holds words; the last one is of marks, if any."""
-        names = [self.heads[k].partition(" [") for k in self._columns_shown]
+        names = [self.heads[k].partition(" [") for k in self._shown_column_indices]
         words = [k == 0 or name in self.words for k, (name, *_) in enumerate(names)]
         shown = [(name, unit[:-1], w) for (name, _, unit), w in zip(names, words, strict=True)]
-        return shown + [("", "", True)] * self._has_marks
+        return shown + [("", "", True)] * self._has_mark_column
 
     @property
     def cells(self) -> list[list[Cell]]:
         """What stands in each row that is shown."""
-        shown, marks = self._columns_shown, self._has_marks
+        shown, marks = self._shown_column_indices, self._has_mark_column
         return [
             [_cell(row.cells[k]) for k in shown] + [Cell(MARKS[row.level])] * marks
             for row in self.rows
         ]
 
     @property
-    def texts(self) -> list[list[str]]:
+    def cell_texts(self) -> list[list[str]]:
         """Cells of each row as text."""
         return [[str(cell) for cell in cells] for cells in self.cells]
 
     @property
-    def _columns_shown(self) -> list[int]:
+    def _shown_column_indices(self) -> list[int]:
         every = range(len(self.heads))
         return [k for k in every if k == 0 or any(str(_cell(r.cells[k])) for r in self.rows)]
 
     @property
-    def _has_marks(self) -> bool:
+    def _has_mark_column(self) -> bool:
         return any(row.level for row in self.rows) and not self.bare
 
     def html(self, kind: str = "") -> str:
@@ -170,7 +170,7 @@ class FactTable:
             side = "left" if words else "right"
             grid.add_column(Text(head, "bold"), justify=side, width=width, overflow="fold")
         heading = ""
-        for row, (first, *cells) in zip(self.rows, self.texts, strict=True):
+        for row, (first, *cells) in zip(self.rows, self.cell_texts, strict=True):
             style, mark = _STYLES[row.level], MARKS[row.level]
             # Behind headings in words, a repeated one is printed once.
             name = Text(first * (first != heading), f"bold {style}") if self.bare else Text(first)
@@ -182,7 +182,7 @@ class FactTable:
         """Width of each column, the widest words wrapped first; None if words would be torn apart."""
         from rich.cells import cell_len
 
-        rows = [*self.texts] if self.bare else [heads, *self.texts]
+        rows = [*self.cell_texts] if self.bare else [heads, *self.cell_texts]
         lines = [[x for row in rows for x in row[k].split("\n")] for k in range(len(heads))]
         widths = [max(map(cell_len, column), default=0) for column in lines]
         least = []

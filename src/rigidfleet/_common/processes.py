@@ -7,14 +7,14 @@ from collections.abc import Generator
 from contextlib import contextmanager
 
 
-def cores() -> int:
+def usable_core_count() -> int:
     """Number of cores that this process may use."""
     usable = getattr(os, "sched_getaffinity", None)
     return len(usable(0)) if usable is not None else os.cpu_count() or 1
 
 
 @contextmanager
-def keep_folder_off_path() -> Generator[None]:
+def set_python_safe_path() -> Generator[None]:
     """Keep the current folder off the module path of Python processes that are started in this context."""
     name = "PYTHONSAFEPATH"
     before = os.environ.get(name)

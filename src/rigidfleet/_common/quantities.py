@@ -94,7 +94,7 @@ def _motion_quantity(order: int, way: str, what: str, unit: str) -> Quantity:
     )  # fmt: skip
 
 
-def _no_fence(mission: Any) -> bool:
+def _has_no_fence(mission: Any) -> bool:
     return mission.limits.geofence is None
 
 
@@ -104,7 +104,7 @@ QUANTITIES: dict[str, Quantity] = {
     for q in (
         Quantity(
             "separation", "m", "least distance between two vehicles' surfaces", "pair", "least", "limits.separation",
-            lambda mission: mission.limits.separation_always or 0.0, by_phase=True,
+            lambda mission: mission.limits.separation_at_all_heights or 0.0, by_phase=True,
             words="{who} come within {worst} of each other at {when:.2f} s (limit {limit:g} m)",
         ),
         Quantity(
@@ -130,7 +130,7 @@ QUANTITIES: dict[str, Quantity] = {
         ),
         Quantity(
             "geofence", "m", "greatest distance of a vehicle's centre outside the geofence; negative inside",
-            key="limits.geofence", limit=lambda m: None if _no_fence(m) else 0.0,
+            key="limits.geofence", limit=lambda m: None if _has_no_fence(m) else 0.0,
         ),
         *(
             Quantity(
@@ -146,11 +146,11 @@ QUANTITIES: dict[str, Quantity] = {
         ),
         Quantity(
             "lowest", "m", "least altitude of a vehicle's centre", sense="least", checked=False,
-            limit=lambda m: None if _no_fence(m) else m.limits.geofence.min[2],
+            limit=lambda m: None if _has_no_fence(m) else m.limits.geofence.min[2],
         ),
         Quantity(
             "highest", "m", "greatest altitude of a vehicle's centre", checked=False,
-            limit=lambda m: None if _no_fence(m) else m.limits.geofence.max[2],
+            limit=lambda m: None if _has_no_fence(m) else m.limits.geofence.max[2],
         ),
         *(
             _motion_quantity(order, way, what, unit)

@@ -168,7 +168,7 @@ class TextTable:
             raise fault(f"has columns {', '.join(ways)}, but the axes are {axes}", "Remove one")
         return self.find(*ways, who=who), named
 
-    def missing_error(self, *kinds: str) -> ContentError:
+    def missing_columns_error(self, *kinds: str) -> ContentError:
         """The error of a table without some quantities."""
         if self.find("latitude"):
             return fault("has latitude and longitude", "Give metres from an origin: x_m, y_m, z_m")
@@ -295,7 +295,7 @@ def _find_header(texts: list[str]) -> tuple[int, int, list[str], list[str], str,
     most = {k: max((sum(map(is_number, x)), len(x)) for x in fields) for k, fields in split.items()}
     rows = {k: count for k, (count, _) in most.items() if count > 1}
     plain = [k for k in rows if texts[k][0] != "#"]
-    start, names, own = _find_names(texts, [k for k in head if 2 * most[k][0] <= most[k][1]], plain)
+    start, names, own = _find_heads(texts, [k for k in head if 2 * most[k][0] <= most[k][1]], plain)
     if not names:
         # Before rows without names, a line that begins with # may be one of them.
         start = min(rows, default=len(texts))
@@ -320,7 +320,7 @@ def _find_header(texts: list[str]) -> tuple[int, int, list[str], list[str], str,
     return line, start, names, units, separator, width
 
 
-def _find_names(texts: list[str], head: list[int], rows: list[int]) -> tuple[int, list[str], str]:
+def _find_heads(texts: list[str], head: list[int], rows: list[int]) -> tuple[int, list[str], str]:
     """Line, from 1, names and separator: of the lines before the first row below names, the one understood best."""
     best, names = (False, 0.0), (0, [], "")
     for k in head:

@@ -25,7 +25,7 @@ def all_hold_in_words(count: int) -> str:
     return few.get(count, f"all {count} checks hold")
 
 
-def percent(share: float) -> str:
+def percent_text(share: float) -> str:
     """A share in per cent, to two digits below 10 %: "0.25 %", "57 %", "100 %"."""
     value = 100 * share
     return f"{value:.2g} %" if value < 10 else f"{value:.0f} %"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, quantity
-from rigidfleet._common.text import agent_names, percent
+from rigidfleet._common.text import agent_names, percent_text
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.assessment.avoidance import guard_checks
 from rigidfleet.assessment.fits import is_rigid
@@ -52,8 +52,8 @@ def all_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[C
     )
     for q in QUANTITIES.values():
         yield from _CHECKS.get(q.name, _quantity_check)(measured, q)
-    yield from _corner_check(measured)
-    yield from _way_home_check(measured)
+    yield from _velocity_jump_check(measured)
+    yield from _abort_separation_check(measured)
 
 
 def _failures_or_nearest(candidates: Iterable[CheckResult]) -> Iterator[CheckResult]:
@@ -258,7 +258,7 @@ def _touch_down_checks(measured: Measurements, phases: list[PhaseVerdict]) -> It
         yield _check_at_end(p, "touch_down", *judged, who=who)
 
 
-def _corner_check(measured: Measurements) -> Iterator[CheckResult]:
+def _velocity_jump_check(measured: Measurements) -> Iterator[CheckResult]:
     """Fail limits of acceleration where a curve that others made turns at a corner: none is great enough there."""
     result = measured.result
     if result.interpolation is None or not np.isfinite(result.acceleration).any():
@@ -307,7 +307,7 @@ def _flying_separation_check(measured: Measurements, q: Quantity) -> Iterator[Ch
         yield limit_check(q, e, limit, words)
 
 
-def _planned_separation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _certified_separation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """How much nearer agents come in each phase than its plan's certificate says."""
     allowed, checks = q.limit_of(measured.mission), []
     for record, worst in zip(measured.result.phases, measured.worst_by_phase, strict=True):
@@ -321,7 +321,7 @@ def _planned_separation_check(measured: Measurements, q: Quantity) -> Iterator[C
     yield from _failures_or_nearest(checks)
 
 
-def _way_home_check(measured: Measurements) -> Iterator[CheckResult]:
+def _abort_separation_check(measured: Measurements) -> Iterator[CheckResult]:
     """Compare the separation on the way home, after an abort, with the one that was proved before the flight."""
     since, promised = measured.result.statistics.get("promised", (math.inf, 0.0))
     pairs = zip(measured.result.phases, measured.worst_by_phase, strict=True)
@@ -363,7 +363,7 @@ def _clearance_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResu
             yield limit_check(quantity(name), e, q.limit_of(measured.mission), words, passed=True)
 
 
-def _loss_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _lost_vehicle_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Check that the vehicles that the mission loses do not hit those still flying; report phases not flown."""
     if not measured.left.all() and measured.mission.first_loss < math.inf:
         who = np.flatnonzero(~measured.left[-1])
@@ -442,7 +442,7 @@ def _thrust_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]
     yield limit_check(q, e, own[e.who])
 
 
-def _rotor_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _rotor_force_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """The rotor nearest to its limit, from step to step and at samples."""
     result, limits = measured.result, np.array(q.limit_of(measured.mission))
     if result.rotor_force is None or not limits.any():
@@ -472,8 +472,8 @@ def _saturation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResu
     if e is None or not any(model.rotor_limit for model in measured.mission.vehicle_models or ()):
         return
     words = (
-        f"{e.who} cannot give what is asked of it for {percent(e.value / 100)} of phase '{e.phase}'"
-        f" (limit {percent(limit / 100)})"
+        f"{e.who} cannot give what is asked of it for {percent_text(e.value / 100)} of phase '{e.phase}'"
+        f" (limit {percent_text(limit / 100)})"
     )
     if e.value == 0.0:
         yield CheckResult(q.name, True, q.nothing, 0.0, limit, q.unit)
@@ -502,13 +502,13 @@ def _tracking_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
 _CHECKS: dict[str, Callable[[Measurements, Quantity], Iterator[CheckResult]]] = {
     "separation": _separation_check,
     "separation_flying": _flying_separation_check,
-    "separation_as_planned": _planned_separation_check,
+    "separation_as_planned": _certified_separation_check,
     "clearance": _clearance_checks,
-    "lost": _loss_checks,
+    "lost": _lost_vehicle_checks,
     "geofence": _geofence_check,
     **dict.fromkeys(("fence", "soft_fence", "people"), _boundary_check),
     "thrust": _thrust_checks,
-    "rotor_force": _rotor_check,
+    "rotor_force": _rotor_force_check,
     "saturation": _saturation_check,
     "tilt": _tilt_check,
     "tracking_error": _tracking_check,

@@ -69,11 +69,11 @@ class DrawnWays:
     states: Floats
 
     @cached_property
-    def measurements(self) -> Measurements:
+    def likely_measurements(self) -> Measurements:
         """The likely flight."""
         return Measurements(self.result)
 
-    def deviation_of(self, check: CheckResult) -> float:
+    def uncertainty_of(self, check: CheckResult) -> float:
         """By how much what is judged may differ from what is true, in the unit of the check."""
         name, order, shifts = _quantity_name(check), _derivative_order(check), self.states
         q = quantity(name)
@@ -82,26 +82,26 @@ class DrawnWays:
         if name in _AT_END:
             k = int(np.abs(self.result.time - (check.when or 0.0)).argmin())
             if name not in _SHAPES:
-                return _greatest_length(shifts[:, order, k])
+                return _greatest_norm(shifts[:, order, k])
             i, j = proximity.all_pairs(self.result.n_agents)
-            by = _greatest_length(shifts[:, 0, k, i] - shifts[:, 0, k, j])
-            least = float(_lengths(self.result.position[k, i] - self.result.position[k, j]).min())
+            by = _greatest_norm(shifts[:, 0, k, i] - shifts[:, 0, k, j])
+            least = float(_norms(self.result.position[k, i] - self.result.position[k, j]).min())
             if check.worst is None:  # what is lost where vehicles may change places
                 return by if by > 0.5 * least else 0.0
             return math.degrees(math.atan2(by, least)) if check.unit == "deg" else by
-        sizes = _lengths(shifts[:, order])
+        sizes = _norms(shifts[:, order])
         most = float(sizes.max(initial=0.0))
         if q.name in ("separation", "separation_flying"):
             k, i, j = self._near_pairs(float(check.worst or 0.0) + 4.0 * most)
-            return _greatest_length(shifts[:, 0, k, i] - shifts[:, 0, k, j])
+            return _greatest_norm(shifts[:, 0, k, i] - shifts[:, 0, k, j])
         if _is_of_pairs(name):
             return 2.0 * most
         if name == "people":  # where one falls depends on its velocity, for the time of a fall
             height, gravity = np.ptp(self.result.position[..., 2]), self.result.mission.gravity
-            return most + math.sqrt(2.0 * height / gravity) * _greatest_length(shifts[:, 1])
-        values = -self.measurements.closeness.each if name == "clearance" else None
+            return most + math.sqrt(2.0 * height / gravity) * _greatest_norm(shifts[:, 1])
+        values = -self.likely_measurements.closeness.each if name == "clearance" else None
         if name in SAMPLED and q.who == "agent":
-            values = self.measurements.samples_of(name).rank
+            values = self.likely_measurements.samples_of(name).rank
         if values is None or values.shape != sizes.shape[1:]:
             return most
         # Only what is near the worst value may be the worst in truth.
@@ -111,7 +111,7 @@ class DrawnWays:
         """Samples and pairs whose surfaces are nearer than a distance: the nearest ones, if they are many."""
         radius, (i, j) = self.result.mission.fleet.radius, proximity.all_pairs(self.result.n_agents)
         parts = np.array_split(self.result.position, -(-len(self.result.time) * len(i) // _AT_ONCE))
-        apart = np.concatenate([_lengths(r[:, i] - r[:, j]).astype(np.float32) for r in parts])
+        apart = np.concatenate([_norms(r[:, i] - r[:, j]).astype(np.float32) for r in parts])
         apart = (apart - (radius[i] + radius[j])).ravel()
         near = np.flatnonzero(apart <= max(reach, float(apart.min())))
         if len(near) > _CANDIDATES:
@@ -120,12 +120,12 @@ class DrawnWays:
         return k, i[pair], j[pair]
 
 
-def _lengths(x: Floats) -> Floats:
+def _norms(x: Floats) -> Floats:
     return np.sqrt(np.einsum("...a,...a->...", x, x))
 
 
-def _greatest_length(x: Floats) -> float:
-    return float(_lengths(x).max(initial=0.0))
+def _greatest_norm(x: Floats) -> float:
+    return float(_norms(x).max(initial=0.0))
 
 
 def _quantity_name(check: CheckResult) -> str:
@@ -143,7 +143,7 @@ def _is_of_pairs(name: str) -> bool:
     return name in (*_SHAPES, "separation_as_planned") or quantity(name).who in ("pair", "edge")
 
 
-def verdict_with_doubt(
+def verdict_with_intervals(
     verdict: Verdict, deviations: DrawnWays | None, facts: dict[str, Any], *, shared: bool
 ) -> Verdict:
     """A verdict with intervals.
@@ -162,7 +162,7 @@ def verdict_with_doubt(
             why = "vehicles have no common clock"
             check = replace(check, worst=None, first=None)  # noqa: PLW2901
         if deviations and not why and name not in (*_CERTAIN, *_UNSEEN):
-            check = _with_interval(check, deviations.deviation_of(check), facts["noise_m"])  # noqa: PLW2901
+            check = _with_interval(check, deviations.uncertainty_of(check), facts["noise_m"])  # noqa: PLW2901
             check = _leave_open_at_reset(check, resets)  # noqa: PLW2901
         elif why and check.judged and name not in _CERTAIN:
             words = f"{name.replace('_', ' ')} is not judged: {why}"
@@ -210,7 +210,7 @@ def _leave_open_at_reset(check: CheckResult, resets: list[float]) -> CheckResult
     return replace(check, undecided=True, message=words)
 
 
-def doubt_facts(
+def uncertainty_facts(
     flown: Result, deviations: DrawnWays | None, estimate: NoiseEstimate, alignment: Alignment | None, clock: str
 ) -> dict[str, Any]:  # fmt: skip
     """What is told of noise, clock, set-up and, beside a plan, of vehicles: how far off their slots, and when."""
@@ -231,7 +231,7 @@ def doubt_facts(
     columns = {
         "name": flown.statistics["names"], "mean_off_m": size, "mean_error_m": by, "mean_off_xyz_m": mean,
         "worst_off_m": far[worst, each], "worst_at_s": flown.time[worst], "offset_s": alignment.own.T,
-        "off_its_slot": aside, "late": alignment.has_own_offset,
+        "off_its_slot": aside, "late": alignment.has_own_clock_offset,
     }  # fmt: skip
     rows = zip(*(np.asarray(x).tolist() for x in columns.values()), strict=True)
     vehicles = [dict(zip(columns, row, strict=True)) for row in rows]

@@ -111,7 +111,7 @@ class Measurements:
     def extreme_of(self, name: str, x: Extremum, phase: str) -> Extreme:
         """An extreme of a phase, as it was recorded."""
         q = quantity(name)
-        return Extreme(_size(q, x), x.time, owner_name(self.result, q, x.who, x.other), phase)
+        return Extreme(_in_unit(q, x), x.time, owner_name(self.result, q, x.who, x.other), phase)
 
     def worst(self, name: str) -> Extreme | None:
         """The worst value of a flight, at its samples or between them; None if it is not known."""
@@ -126,7 +126,7 @@ class Measurements:
         q = quantity(name)
         rank = q.rank
         every = [(p.extremes[name], p.name) for p in self.result.phases if name in p.extremes]
-        worst = max(every, key=lambda each: rank(_size(q, each[0])), default=None)
+        worst = max(every, key=lambda each: rank(_in_unit(q, each[0])), default=None)
         between = None if worst is None else self.extreme_of(name, *worst)
         sampled = None if values is None else self.worst_sample(values, alone=between is None)
         if sampled is None or between is None:
@@ -141,7 +141,7 @@ class Measurements:
             q, alone = sampled.quantity, name not in self.names_recorded
             for k, (phase, worst) in enumerate(zip(self.result.phases, every, strict=True)):
                 x, rank = phase.extremes.get(name), self.phase_ranks.get((name, k), -math.inf)
-                if x is not None and rank < q.rank(_size(q, x)):
+                if x is not None and rank < q.rank(_in_unit(q, x)):
                     worst[name] = self.extreme_of(name, x, phase.name)
                 elif e := self.worst_sample(sampled, self.parts[k], alone=alone):
                     worst[name] = e
@@ -209,7 +209,7 @@ class Measurements:
             for name in ("separation", "clearance"):
                 if name in vars(result):  # else it would be made of these very positions
                     stored[name] = getattr(result, name) - getattr(self.closeness, name)
-        stored["distance"] = np.abs(proximity.lengths(r, result.edges).T - result.distance)
+        stored["distance"] = np.abs(proximity.pair_distances(r, result.edges).T - result.distance)
         stored["thrust"] = self.samples_of("thrust").values - result.thrust
         for name, off in stored.items():
             unit, least = ("N", 1e-6) if name == "thrust" else ("m", rounding)
@@ -265,7 +265,7 @@ class Measurements:
             distances=self.shape_errors_and_fits[0].get(index),
             shape=None if fit is None else fit.error,
             handedness=None if fit is None or fit.dimension < 3 else not fit.is_mirrored,
-            flip=self.flip_angles.get(index),
+            flip=self.axis_errors_at_end.get(index),
             order=None if fit is None else fit.in_order,
             waypoint=waypoints.get((index, "target")),
             stay=waypoints.get((index, "stay")),
@@ -307,7 +307,7 @@ class Measurements:
             phases, samples = zip(*ends, strict=True)
             r, left = result.position[[*samples]], np.flatnonzero(self.left[samples[0]])
             edges, intended = self.edges_at_sample(name, samples[0])
-            off = proximity.lengths(r, edges).T - intended
+            off = proximity.pair_distances(r, edges).T - intended
             errors.update(zip(phases, _row_maxima(off), strict=True))
             slots = mission.formation_slots(name)
             if slots is not None and len(left) > 1 and finite:
@@ -322,7 +322,7 @@ class Measurements:
         return self.shape_errors_and_fits[1]
 
     @cached_property
-    def flip_angles(self) -> dict[int, float | None]:
+    def axis_errors_at_end(self) -> dict[int, float | None]:
         """Angle [deg] of a line or plane from its intended direction at the end of each phase that has one."""
         flat = {index: fit for index, fit in self.fits_at_end.items() if fit.dimension < 3}
         if not flat:
@@ -386,7 +386,7 @@ class Measurements:
         return misses
 
 
-def _size(q: Quantity, x: Extremum) -> float:
+def _in_unit(q: Quantity, x: Extremum) -> float:
     """The value of an extreme in the unit of its quantity; of a constraint, its size."""
     return abs(x.value) if q.name == "constraint" else q.scale * x.value
 

@@ -22,8 +22,8 @@ _NAMED = 20
 def verdict_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     """Facts that fail no check but that a reader should know."""
     yield from _abandonment_notes(measured)
-    yield from _below_zero_notes(measured)
-    yield from _turnover_notes(measured, phases)
+    yield from _negative_height_notes(measured)
+    yield from _formation_flip_notes(measured, phases)
     yield from _fall_notes(measured)
     pairs, times = measured.mission.links_lost
     for (i, j), t in zip(pairs + 1, times, strict=True):
@@ -37,7 +37,7 @@ def verdict_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
             who = agent_names(np.flatnonzero(full.any(axis=0)))
             since = measured.first_time(full.max(axis=1))
             yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
-    if words := measured.mission.landings_in_words(measured.result.position[-1]):
+    if words := measured.mission.landing_swaps_in_words(measured.result.position[-1]):
         yield words
     yield from clock_notes(measured.result)
     yield from avoidance_notes(measured)
@@ -106,7 +106,7 @@ def _abandonment_notes(measured: Measurements) -> Iterator[str]:
     if result.mission.abandons_at < np.inf:
         return  # no phase of such a mission was begun by hand
     for phase, record in zip(result.mission.phases, result.phases, strict=False):
-        if phase.meets and record.target is None and record.settled is None:
+        if phase.commanded_at_arrival and record.target is None and record.settled is None:
             yield f"'{record.name}' was left at {record.t_end:.2f} s, before its arrival, which is not judged"
 
 
@@ -134,7 +134,7 @@ def _fall_notes(measured: Measurements) -> Iterator[str]:
             yield f"{words} is still falling at z = {r[-1, 2]:.1f} m when the flight ends"
 
 
-def _below_zero_notes(measured: Measurements) -> Iterator[str]:
+def _negative_height_notes(measured: Measurements) -> Iterator[str]:
     """Note agents below z = 0 if the mission has neither a ground nor a geofence."""
     mission = measured.mission
     if mission.limits.geofence is not None or any(
@@ -150,7 +150,7 @@ def _below_zero_notes(measured: Measurements) -> Iterator[str]:
         yield f"{e.who} {words}; the mission has no ground"
 
 
-def _turnover_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
+def _formation_flip_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     """Note planar formations that turn over between phases while no attitude is commanded."""
     seen: dict[str, tuple[list[float], float]] = {}
     for i, p in enumerate(phases):

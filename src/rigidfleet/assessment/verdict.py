@@ -269,14 +269,14 @@ class Verdict(Shown):
         return [check for check in self.checks if not (check.passed or check.undecided)]
 
     @property
-    def open_checks(self) -> list[CheckResult]:
+    def undecided_checks(self) -> list[CheckResult]:
         """Checks of what was measured that may hold or not."""
         return [check for check in self.checks if check.undecided]
 
     @property
     def word(self) -> str:
         """Passed, failed or undecided."""
-        return "failed" if self.failures else "undecided" if self.open_checks else "passed"
+        return "failed" if self.failures else "undecided" if self.undecided_checks else "passed"
 
     @property
     def by_name(self) -> dict[str, CheckResult]:
@@ -309,8 +309,8 @@ class Verdict(Shown):
     def _verdict_in_words(self) -> str:
         judged = [check for check in self.checks if check.judged]
         if self.word != "passed":
-            some = self.failures or self.open_checks
-            lines = [*self.failures, *self.open_checks]
+            some = self.failures or self.undecided_checks
+            lines = [*self.failures, *self.undecided_checks]
             head = f"{self.word.capitalize()}: {len(some)} of {len(judged)} checks."
             return "\n".join([head, *(f"- {check.message}" for check in lines)])
         by_check = {f.check: f for f in self.checks if f.worst is not None}
@@ -353,7 +353,7 @@ class Verdict(Shown):
         judged = [check for check in self.checks if check.judged]
         failed = len(self.failures)
         if self.word == "undecided":
-            return f"<Verdict {self.mission}: undecided in {len(self.open_checks)} of {len(judged)} checks>"
+            return f"<Verdict {self.mission}: undecided in {len(self.undecided_checks)} of {len(judged)} checks>"
         ending = f"failed {failed} of {len(judged)}" if failed else f"passed all {len(judged)}"
         return f"<Verdict {self.mission}: {ending} checks>"
 

@@ -71,7 +71,7 @@ def check(
             loaded = load_mission(mission)
             if expand is not None:
                 loaded = expand_mission(loaded)
-                write_file(expand, (loaded.about + to_toml(loaded.to_dict())).encode())
+                write_file(expand, (loaded.file_digests_text + to_toml(loaded.to_dict())).encode())
             loaded = complete_times(loaded)
     except MissionError as error:
         if not json:

@@ -245,7 +245,7 @@ class FlightWatch(_Screen):
         if took >= _KNOWN and flown > 0.0 and last.t < last.t_end:
             speed = flown / took
             digits = ".0f" if speed >= 9.95 else ".1f" if speed >= 0.1 else ".1g"
-            words += [f"x{speed:{digits}}", _time_left((last.t_end - last.t) / speed)]
+            words += [f"x{speed:{digits}}", _time_left_text((last.t_end - last.t) / speed)]
         return "  ".join([*words, last.phase, *(["(planning)"] if last.planning else [])])
 
 
@@ -276,17 +276,17 @@ class SweepWatch(_Screen):
         words = [f"{p.done} of {p.runs} runs"]
         if (wall := p.wall - self.base.wall) > 0 and (flown := p.flown - self.base.flown) > 0:
             rate = flown / wall
-            words += [f"{rate:.3g} runs/s", _time_left((p.runs - p.done) / rate)]
+            words += [f"{rate:.3g} runs/s", _time_left_text((p.runs - p.done) / rate)]
         words += [f"{p.failed} failed"] if p.failed else []
-        words += [f"{count(p.workers, 'worker')}"] if p.workers > 1 else []
+        words += [f"{count_text(p.workers, 'worker')}"] if p.workers > 1 else []
         return "  ".join(words)
 
 
-def _time_left(seconds: float) -> str:
+def _time_left_text(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes}:{rest:02} left"
 
 
-def count(n: int, noun: str) -> str:
+def count_text(n: int, noun: str) -> str:
     """Number and noun, in the plural unless the number is 1."""
     return f"{n} {noun}{'' if n == 1 else 's'}"

@@ -100,11 +100,11 @@ def design(
         text += designs.mission_fragment(name, slots, chosen, reach)
         if colours is not None:
             text += f"colour = {dumps(colours)}\n"
-        judged = {what: rigidity_of_graph(slots, graph) for what, graph in kinds.items()}
+        judged = {what: rigidity_data_and_row(slots, graph) for what, graph in kinds.items()}
     except ValueError as error:
         words = str(error).rstrip(".")
         raise RigidfleetError(f"{shape}: {words}{'' if words.endswith('?') else '.'}") from None
-    limits = designs.limits(slots)
+    limits = designs.free_motions_text(slots)
     for note in notes:
         console.err().print(f"Note: {shape}: {note}.")
     if out is not None:
@@ -159,7 +159,7 @@ def _refuse_options_that_clash(
         raise ValueError(f"--reach must be a positive number, not {reach:g}")
 
 
-def rigidity_of_graph(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[Any, ...]]:
+def rigidity_data_and_row(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[Any, ...]]:
     """Rigidity of slots (N, 3) with a graph: as data, and as cells of a row of the table."""
     import numpy as np
 

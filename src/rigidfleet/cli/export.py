@@ -68,7 +68,7 @@ def export(
         made = write(flight, path, format, rate=rate, tolerance=tolerance, flown=flown)  # ty: ignore[invalid-argument-type]
     except ValueError as error:
         raise RigidfleetError(f"{error}.") from None
-    if words := flight.mission.landings_in_words(flight.position[-1]):
+    if words := flight.mission.landing_swaps_in_words(flight.position[-1]):
         console.warn(f"{words}.")
     console.out().print(f"{made}\nExport   {path}", soft_wrap=True)
     return PASSED

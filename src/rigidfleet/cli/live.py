@@ -48,7 +48,7 @@ def live(
     from rigidfleet.web.live import live as fly
 
     place = Files(out or Path("flights", f"{flown.name.removesuffix('-live')}-live"), "")
-    place.test_folder()
+    place.check_folder_writable()
 
     def save_flight(result: Result) -> str:
         files = Files(place.folder, result.mission.name).make_new_folder()

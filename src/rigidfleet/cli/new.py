@@ -207,7 +207,7 @@ def _ask_for_mission(name: str) -> tuple[str, dict[str, Any]]:
         return value
 
     def parse_shape(text: str) -> str:
-        draft.shape_known(text)
+        draft.check_shape_name(text)
         return text
 
     def count(text: str) -> int:

@@ -36,7 +36,7 @@ class Files:
         self.verdict = folder / "verdict.json"
         self.report, self.replay = folder / "report.html", folder / "replay.html"
 
-    def figures(
+    def figure_paths(
         self, which: Literal["few", "all"] = "all", formats: Iterable[str] | None = None
     ) -> list[Path]:
         """All possible figures, or the few that are looked at after a flight; by default in all formats."""
@@ -47,9 +47,9 @@ class Files:
         return [self.folder / "figures" / f"{name}.{kind}" for name in names for kind in kinds]
 
     @property
-    def beside_result(self) -> list[Path]:
+    def derived_paths(self) -> list[Path]:
         """All files that are derived from the result."""
-        return [self.verdict, self.table, self.report, self.replay, *self.figures()]
+        return [self.verdict, self.table, self.report, self.replay, *self.figure_paths()]
 
     def check_writable(self, *, replace: bool) -> None:
         """Check before a flight that its files can be written.
@@ -59,10 +59,10 @@ class Files:
         ResultError
             Files exist and must not be overwritten, or the folder cannot be written.
         """
-        refuse_overwriting(self.result, *self.beside_result, force=replace)
-        self.test_folder()
+        refuse_overwriting(self.result, *self.derived_paths, force=replace)
+        self.check_folder_writable()
 
-    def test_folder(self) -> None:
+    def check_folder_writable(self) -> None:
         """Test that the folder, or the folder in which it will be created, can be written.
 
         Raises
@@ -112,7 +112,7 @@ class Files:
 
         make_folder(self.folder)
         result.save(self.result)
-        for path in self.beside_result:
+        for path in self.derived_paths:
             path.unlink(missing_ok=True)
         verdict = assess(result) if verdict is None else verdict
         self.write_verdict(verdict)
@@ -132,8 +132,8 @@ class Files:
             if path.exists():
                 how = " (open it in a browser)" if path.suffix == ".html" else ""
                 console.out().print(f"{what:8} {path}{how}", soft_wrap=True)
-        if drawn := [path for path in self.figures() if path.exists()]:
-            text = f"Figures  {drawn[0].parent}{os.sep} ({console.count(len(drawn), 'file')})"
+        if drawn := [path for path in self.figure_paths() if path.exists()]:
+            text = f"Figures  {drawn[0].parent}{os.sep} ({console.count_text(len(drawn), 'file')})"
             console.out().print(text, soft_wrap=True)
 
 

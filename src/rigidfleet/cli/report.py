@@ -88,7 +88,7 @@ def report(
         page = (out or Path()) / "comparison.html"
         refuse_overwriting(page, force=force)
     files = Files(out or (Path() if others else result.parent), records[0].mission.name)
-    files.test_folder()
+    files.check_folder_writable()
     verdicts = [assess(record) for record in records]
     if json:
         verdict_data = [verdict.to_dict() for verdict in verdicts]
@@ -104,7 +104,7 @@ def report(
             console.out().print(f"\nReport   {page}", soft_wrap=True)
     else:
         console.show_verdict(verdicts[0], quiet=json or quiet)
-        drawn = [] if no_figures else files.figures(figures, format or DRAWN)
+        drawn = [] if no_figures else files.figure_paths(figures, format or DRAWN)
         made = [files.verdict, files.report, *drawn]
         kept = [] if force else [path for path in made if path.exists()]
         if files.verdict not in kept:
@@ -117,7 +117,7 @@ def report(
             files.print_paths()
         if kept and not quiet:
             console.err().print(
-                f"{console.count(len(kept), 'existing file')} kept; use --force to overwrite"
+                f"{console.count_text(len(kept), 'existing file')} kept; use --force to overwrite"
             )
     return PASSED if all(verdict.passed for verdict in verdicts) else FAILED
 
@@ -175,7 +175,7 @@ def _drill_sentences(folder: Path, mission: Mission) -> list[str]:
         )
     if own.digest != mission.digest:  # a result has the ways that were planned for its mission
         _refuse_other_mission(path, expand_mission(own).digest, mission)
-    return [*outcome.rehearsals(), _name_and_digest(path)]
+    return [*outcome.drill_sentences(), _name_and_digest(path)]
 
 
 def _abort_sentences(folder: Path, mission: Mission) -> list[str]:

@@ -113,7 +113,7 @@ def run(
             if replay:
                 write_replay(result, files.replay)
             if not no_figures:
-                paths = files.figures(figures, format or DRAWN)
+                paths = files.figure_paths(figures, format or DRAWN)
                 write_figures(result, paths, quiet=quiet, titles=not no_titles, width=width)
         except KeyboardInterrupt:
             interrupted = True

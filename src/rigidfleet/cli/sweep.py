@@ -135,7 +135,7 @@ def sweep(
         folder = shards.shard_folder(whole, shard)
         if (map_ or metric) and definition.drill:
             raise RigidfleetError("--map and --metric: a drill has no map. Remove them.")
-        numbers = [column.name for column in definition.columns if column.in_order]
+        numbers = [column.name for column in definition.columns if column.has_order]
         figures.check_map(numbers, map_ or (), metric or "success")
         try:
             with show_progress(None if quiet else console.SweepWatch()) as progress:
@@ -162,7 +162,7 @@ def sweep(
         console.out().print(f"\nRuns     {folder / store.FILE}", soft_wrap=True)
         console.out().print(f"Summary  {folder / 'summary.json'}", soft_wrap=True)
         if drawn:
-            text = f"Figures  {drawn[0].parent}{os.sep} ({console.count(len(drawn), 'file')})"
+            text = f"Figures  {drawn[0].parent}{os.sep} ({console.count_text(len(drawn), 'file')})"
             console.out().print(text, soft_wrap=True)
     if outcome.reasons and set(table.reason) <= {*UNJUDGED}:
         reason, example = next(iter(outcome.examples.items()))

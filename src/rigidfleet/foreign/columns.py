@@ -132,7 +132,7 @@ def parse_table(data: bytes, words: Units) -> tuple[TextTable, list[str]]:
 def _times_and_epoch(table: TextTable, notes: list[str]) -> tuple[Floats, int | None]:
     """Times (K,) [s], and the nanoseconds since 1970 from which they count; None if they are no dates."""
     if not (columns := table.find("time")):
-        raise table.missing_error("time")
+        raise table.missing_columns_error("time")
     fields = table.columns[columns[0]].tolist() or [""]
     number = is_number(fields[0])
     if not table.lines.size or (number and abs(float(fields[0].replace(",", "."))) < _DATES[0]):
@@ -254,7 +254,7 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
     flown = {who: own for who, own in sets.items() if who not in ROLES} or sets
     flown = {"": sets[""]} if "" in sets else flown
     if not flown:
-        raise table.missing_error(*"xyz")
+        raise table.missing_columns_error(*"xyz")
     main = next(iter(flown))
     for who in loose.keys() - flown.keys():
         names = ", ".join(table.names[k] for k in loose[who].values())

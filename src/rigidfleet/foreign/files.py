@@ -137,7 +137,7 @@ def read_trajectories(
     sampled = assumed in ASSUMED.values()
     away = spans == "away" or (sampled and spans == "refuse")
     since = min(part.read[0].get("since_1970_ns") or 0 for part in parts) / 1e9
-    records = _records_of_alike_files(parts)
+    records = _merge_reading_records(parts)
     measured = tuple(own for part in parts for own in part.measured)
     measured = measured if len(measured) == len(curves) else ()
     read = Trajectories(names, curves, assumed, (), records, away, since, measured, own_clocks)
@@ -191,7 +191,7 @@ def _put_on_one_clock(parts: list[Trajectories], sources: list[Path]) -> list[Tr
     ]
 
 
-def _records_of_alike_files(parts: list[Trajectories]) -> tuple[dict[str, Any], ...]:
+def _merge_reading_records(parts: list[Trajectories]) -> tuple[dict[str, Any], ...]:
     """What was taken for what, once for files that are alike."""
     alike: dict[str, list[Trajectories]] = {}
     for part in parts:
@@ -336,7 +336,7 @@ def _read_file(
         elif head.startswith(_ZIP) or suffix == ".skyc":
             read = shows.read_show(_content_of(path))
         else:
-            read = texts.read_text(_content_of(path), path.stem, interpolation, units)
+            read = texts.read_text_table(_content_of(path), path.stem, interpolation, units)
         if (units.words or units.axes) and "units" not in read.read[0]:
             raise fault("says its units and axes itself", "Remove --units and --axes")
         for who, curve in zip(read.names, read.curves, strict=True):

@@ -145,7 +145,7 @@ def _curve_of_drone(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who:
     points = _value_at(trajectory, "points", list, who)
     if not points:
         raise fault(f"{who}: its trajectory has no points")
-    start = _floats(trajectory.get("takeoffTime", 0), (), f"{who}: takeoffTime")
+    start = _to_floats(trajectory.get("takeoffTime", 0), (), f"{who}: takeoffTime")
     where = [f"{who}: point {k}" for k in range(1, len(points) + 1)]
     for place, point in zip(where, points, strict=True):
         if not isinstance(point, list) or len(point) < 2:
@@ -179,7 +179,7 @@ def _curve_of_drone(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who:
         pieces[:, 3] = np.nan
         return curve
     setpoints = _value_at(yaw, "setpoints", list, who)
-    times, degrees = _floats(setpoints, (None, 2), f"{who}: yaw setpoints").T
+    times, degrees = _to_floats(setpoints, (None, 2), f"{who}: yaw setpoints").T
     if (np.diff(times) < 0.0).any():
         raise fault(f"{who}: yaw setpoints: times go back", "Give increasing times")
     return with_headings(curve, times, -np.radians(degrees))
@@ -189,11 +189,11 @@ def _parse_float_rows(values: list[Any], shape: tuple[int, ...], where: list[str
     """Finite numbers (K, ...) of values of one shape, read at once; one by one where one of them is wrong."""
     if not any(isinstance(value, str | bool) for value in values):
         with suppress(ContentError):
-            return _floats(values, (None, *shape), "")
-    return np.array([_floats(value, shape, w) for value, w in zip(values, where, strict=True)])
+            return _to_floats(values, (None, *shape), "")
+    return np.array([_to_floats(value, shape, w) for value, w in zip(values, where, strict=True)])
 
 
-def _floats(value: Any, shape: tuple[int | None, ...], where: str) -> Any:
+def _to_floats(value: Any, shape: tuple[int | None, ...], where: str) -> Any:
     """Finite numbers of a shape, in which None is any length."""
     try:
         numbers = np.asarray(value, dtype=float)

@@ -24,7 +24,7 @@ POLYNOMIALS = "the polynomials of the file"
 _SHARE, _LEAST = 0.05, 0.05
 
 
-def read_text(data: bytes, stem: str, interpolation: str, units: Units) -> Trajectories:
+def read_text_table(data: bytes, stem: str, interpolation: str, units: Units) -> Trajectories:
     """The vehicles of a table; the only one is named by the file's stem.
 
     Raises

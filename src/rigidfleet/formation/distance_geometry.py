@@ -101,7 +101,7 @@ def _squared_volumes(sides: Floats) -> tuple[Floats, Floats]:
     return volume2, volume2 < -REALISABLE * squares.max(axis=0) ** 3
 
 
-def scale_distances(d: Floats) -> tuple[Floats, Floats]:
+def classical_scaling(d: Floats) -> tuple[Floats, Floats]:
     """Squared extents (N,) [m^2] and axes (N, N) of points with distances (N, N) [m]: classical scaling."""
     centring = np.eye(len(d)) - 1 / len(d)
     return np.linalg.eigh(-0.5 * centring @ d**2 @ centring)
@@ -129,7 +129,7 @@ def slots_from_distances(n: int, edges: ArrayLike, lengths: ArrayLike) -> Floats
         return None
     d = np.zeros((n, n))
     d[e[:, 0], e[:, 1]] = d[e[:, 1], e[:, 0]] = length
-    value, vector = scale_distances(d)
+    value, vector = classical_scaling(d)
     # An eigenvalue is a squared extent; rounding errors alone are no thickness.
     top = np.where(value[-3:] > 1e-12 * value[-1], value[-3:], 0.0)[::-1]
     p = np.zeros((n, 3))

@@ -131,7 +131,7 @@ def _findings_of_faults(faults: Sequence[Fault], name: str, place: str = "line")
     return findings
 
 
-def _hexadecimal(colours: Floats, *, real: bool) -> tuple[str, ...]:
+def _hex_colours(colours: Floats, *, real: bool) -> tuple[str, ...]:
     """Colours of rows (N, 3) from 0 to 255; of shares from 0 to 1, if they are real numbers and none is larger.
 
     Raises
@@ -170,7 +170,7 @@ def _read_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tupl
         raise fault("has numbers such as 00", remedy)
     columns, axes = table.position_columns()
     if not (columns := columns or table.find("x", "y")):
-        raise table.missing_error("x", "y")
+        raise table.missing_columns_error("x", "y")
     if (time := table.find("time")) and len(table.codes(time[0])[1]) > 1:
         remedy = "keep the rows of one, or fly it as a trajectory"
         raise fault("has points of several times", remedy)
@@ -195,7 +195,7 @@ def _read_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tupl
             remedy = "write shares from 0 to 1 with a point (1.0)"
             notes.append(f"colours are at most 1 of 255; {remedy}")
         notes += ["six numbers are read as x, y, z, red, green, blue"] * (not table.named)
-        colours = _hexadecimal(lights, real=real)
+        colours = _hex_colours(lights, real=real)
     return table.lines, points, colours, tuple(notes)
 
 
@@ -213,7 +213,7 @@ def _read_npy(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, .
     points[:, : array.shape[1]] = array[:, :3]
     if array.shape[1] < 6:
         return points, None, ()
-    return points, _hexadecimal(array[:, 3:].astype(np.float64), real=array.dtype.kind == "f"), ()
+    return points, _hex_colours(array[:, 3:].astype(np.float64), real=array.dtype.kind == "f"), ()
 
 
 def _read_ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
@@ -263,7 +263,7 @@ def _read_ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, .
     types = {columns[name] for name in names[3:]}
     colours = values[:, 3:] / (65535.0 if types == {"u2"} else 1.0)
     colours = colours if colours.max(initial=0.0) <= 1.0 else np.round(colours)
-    return values[:, :3].copy(), _hexadecimal(colours, real=types <= {"u2", "f4", "f8"}), ()
+    return values[:, :3].copy(), _hex_colours(colours, real=types <= {"u2", "f4", "f8"}), ()
 
 
 def _bytes_before_vertices(

@@ -104,7 +104,7 @@ def _fit_curves_together(
     # Points are the last axis: arithmetic on long rows is fast.
     wanted = source.at_shares(_CHECKED).transpose(3, 1, 2, 0).reshape(4, len(_CHECKED), -1)
 
-    def pieces_over(who: Ints, i: Ints, j: Ints) -> tuple[Floats, Floats]:
+    def pieces_and_errors(who: Ints, i: Ints, j: Ints) -> tuple[Floats, Floats]:
         """Pieces (M, 4, P) of vehicles (M,) over intervals i to j - 1, and errors as shares of what is allowed."""
         h = time[j] - time[i]
         position, yaw = (
@@ -131,7 +131,7 @@ def _fit_curves_together(
     j, length, who = np.minimum(i + 1, n), np.ones(vehicles, dtype=int), np.arange(vehicles)
     best, fitted = np.zeros((vehicles, 4, 2 * orders)), []
     while len(who):
-        pieces, errors = pieces_over(who, i[who], j[who])
+        pieces, errors = pieces_and_errors(who, i[who], j[who])
         fits = errors <= 1.0
         if (stuck := ~fits & (j[who] == i[who] + 1)).any():
             k, error = i[who][stuck][0], errors[stuck][0]
@@ -221,7 +221,7 @@ def exported_motion(result: Result, *, flown: bool) -> tuple[ExportedMotion, boo
     ResultError
         There is no reference at all, or it has gaps, or a value is not finite.
     """
-    setpoints = result.motion(flown=flown)
+    setpoints = result.setpoints_at_samples(flown=flown)
     yaw, yaw_rate = setpoints.yaw, setpoints.yaw_rate
     if flown:  # a flight without yaw of its own keeps pointing east
         yaw, yaw_rate = np.nan_to_num(yaw), np.nan_to_num(yaw_rate)

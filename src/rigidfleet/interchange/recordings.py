@@ -45,7 +45,7 @@ def write_mcap(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
 
     setpoints = motion.at_rate(rate)
     n = motion.n_agents
-    poses = np.concatenate([setpoints.state[:, 0], _quaternions(setpoints.yaw)], axis=2)
+    poses = np.concatenate([setpoints.state[:, 0], _yaw_quaternions(setpoints.yaw)], axis=2)
     turning = np.zeros((*setpoints.yaw.shape, 3))
     turning[..., 2] = setpoints.yaw_rate
     twists = np.concatenate([setpoints.state[:, 1], turning], axis=2)
@@ -103,7 +103,7 @@ def write_rrd(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     stream = recording.binary_stream()
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     times = rr.TimeColumn("time", duration=setpoints.time)
-    quaternions = _quaternions(setpoints.yaw)
+    quaternions = _yaw_quaternions(setpoints.yaw)
     for i, radius in enumerate(motion.result.mission.fleet.radius.tolist()):
         name = f"vehicles/{i + 1}"
         ball = rr.Points3D([[0.0, 0.0, 0.0]], radii=radius, labels=str(i + 1), show_labels=False)
@@ -145,7 +145,7 @@ def read_rrd(data: bytes) -> list[Piecewise]:
     return ways
 
 
-def _quaternions(yaw: Floats) -> Floats:
+def _yaw_quaternions(yaw: Floats) -> Floats:
     """Quaternions (..., 4), scalar last, body to world, of turns about the vertical."""
     zero = np.zeros_like(yaw)
     return np.stack([zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)], axis=-1)

@@ -22,7 +22,7 @@ from rigidfleet.foreign.shows import read_show
 from rigidfleet.interchange.curves import ExportedMotion, cubic_curves, heading_knots
 from rigidfleet.interchange.lights import light_program
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.result.lights import fades
+from rigidfleet.result.lights import light_fades
 
 #: Greatest number of vehicles of a show.
 MOST = 5000
@@ -43,7 +43,7 @@ def write_skyc(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     if motion.n_agents > MOST:
         raise ResultError(f"a show has at most {MOST} drones, and this flight {motion.n_agents}.")
     mission = motion.result.mission
-    changes = fades(motion.result)
+    changes = light_fades(motion.result)
     drones, files = [], {}
     for agent, curve in enumerate(cubic_curves(motion, tolerance)):
         name = f"agent {agent + 1}"

@@ -4,14 +4,14 @@ import math
 
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.disturbances import spline_value
-from rigidfleet.kernel.fleet import jet_speed
+from rigidfleet.kernel.fleet import downwash_speed
 from rigidfleet.kernel.rigid_body import attitude_matrix
 
 # Share of the body's lift in the ground effect (Sanchez-Cuevas et al. 2017), and the least height, in radii, at which
 # the formula is used.
 _BODY, _LEAST_HEIGHT = 2.0, 0.5
 
-jet = jit_inline(jet_speed)
+jet = jit_inline(downwash_speed)
 
 
 @jit
@@ -31,7 +31,7 @@ def air_velocity(t, h, around, out):
 def add_downwash(S, vehicles, density, T, out):
     """Add to the air (3, N, 3) the jets of all vehicles above, at states S (N, 17).
 
-    Each is that of `fleet.jet_speed`; they add up. T (3, 3) is work.
+    Each is that of `fleet.downwash_speed`; they add up. T (3, 3) is work.
     """
     n = S.shape[0]
     for j in range(n):

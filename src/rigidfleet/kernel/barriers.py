@@ -30,7 +30,7 @@ from rigidfleet.kernel.avoidance import needed_gap_acceleration as _needed_rate
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.constraint import find_multipliers
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve
-from rigidfleet.kernel.moving import braking_limit_beside
+from rigidfleet.kernel.moving import relative_braking_limit
 from rigidfleet.kernel.segments import point_to_obstacle, segment_to_obstacle
 
 #: Greatest number of sweeps, change of an acceleration that ends them [m/s^2].
@@ -166,7 +166,7 @@ def list_barriers(r, v, lost, a):
                 gap = away - a.reach[i] - a.spare[i]
                 s = n[0] * v[i, 0] + n[1] * v[i, 1] + n[2] * v[i, 2]
             elif a.sight.known[o] == KNOWN:
-                x, bound, B = a.sight.track[o], a.sight.bound[o], braking_limit_beside(i, o, a)
+                x, bound, B = a.sight.track[o], a.sight.bound[o], relative_braking_limit(i, o, a)
                 for q in range(3):
                     n[q] = r[i, q] - x[q] - a.lead[i, q] * x[3 + q]
                 away = point_to_obstacle(n[0], n[1], n[2], o, a.solids, n)
@@ -306,9 +306,9 @@ def solve_active_set(count, p, w, a):
         return False
     # The unknowns are corrections of pushes, then of pulls. A push at a bound stays: the sweeps have chosen it.
     for row in range(whole):
-        i, j, n = row_of_system(row, size, p, w, a)
+        i, j, n = pair_and_normal_of_row(row, size, p, w, a)
         for column in range(row + 1):
-            k, l, other = row_of_system(column, size, p, w, a)
+            k, l, other = pair_and_normal_of_row(column, size, p, w, a)
             a.system[row, column] = matrix_entry(i, j, n, k, l, other, a)
         # What is left by the pushes so far and by those at their bounds
         a.right[row] = -difference_along(i, j, n, a.shift)
@@ -326,7 +326,7 @@ def solve_active_set(count, p, w, a):
         if not 0.0 <= push <= a.most[a.active[row]]:
             return False
     for row in range(whole):
-        i, j, n = row_of_system(row, size, p, w, a)
+        i, j, n = pair_and_normal_of_row(row, size, p, w, a)
         push_apart(i, j, n, a.right[row], a)
         if row < size:
             a.push[a.active[row]] += a.right[row]
@@ -336,7 +336,7 @@ def solve_active_set(count, p, w, a):
 
 
 @jit
-def row_of_system(row, size, p, w, a):
+def pair_and_normal_of_row(row, size, p, w, a):
     """Vehicles and unit vector of a row of the system: of one of ``size`` barriers, or after these of an edge."""
     if row < size:
         k = a.active[row]

@@ -97,7 +97,7 @@ def halve_curve(piece, left):
 
 
 @jit
-def squared_length(points, sign, out):
+def squared_norm_coefficients(points, sign, out):
     """Bernstein coefficients (9,) of sign |r|^2 of a curve with control points (15,)."""
     for k in range(9):
         out[k] = 0.0
@@ -110,7 +110,7 @@ def squared_length(points, sign, out):
 
 
 @jit
-def length_at(points, x):
+def norm_at(points, x):
     """|r| of a curve with control points (15,) at x."""
     rest, total = 1.0 - x, 0.0
     for q in range(3):
@@ -132,7 +132,7 @@ def ball_radius(curve):
 
 
 @jit
-def basis_at(x):
+def bernstein_at(x):
     """The five Bernstein polynomials of fourth degree at x."""
     y = 1.0 - x
     return y**4, 4.0 * x * y**3, 6.0 * x * x * y * y, 4.0 * x**3 * y, x**4
@@ -141,7 +141,7 @@ def basis_at(x):
 @jit
 def point_at(curve, x):
     """Point of a curve with control points (5, 3) at x."""
-    a, b, c, d, e = basis_at(x)
+    a, b, c, d, e = bernstein_at(x)
     return (
         a * curve[0, 0] + b * curve[1, 0] + c * curve[2, 0] + d * curve[3, 0] + e * curve[4, 0],
         a * curve[0, 1] + b * curve[1, 1] + c * curve[2, 1] + d * curve[3, 1] + e * curve[4, 1],
@@ -150,7 +150,7 @@ def point_at(curve, x):
 
 
 @jit
-def shortest_length(curve, floor, work, pieces):
+def least_norm_of_curve(curve, floor, work, pieces):
     """Least |r| of a curve with control points (5, 3) and its place, if below ``floor``; otherwise ``floor`` and -1.
 
     Rounding of a squared length of some metres hides lengths of a millimetre. Therefore both halves of a long piece
@@ -173,13 +173,13 @@ def shortest_length(curve, floor, work, pieces):
         # All control points lie beyond a plane across the middle one that is farther than the best length.
         if middle > 0.0 and not along < best * math.sqrt(middle):
             continue
-        start = length_at(piece, 0.0)
+        start = norm_at(piece, 0.0)
         if start < best:
             best, at = start, piece[15]
-        squared_length(piece, 1.0, work[0])
+        squared_norm_coefficients(piece, 1.0, work[0])
         _, place = least_polynomial_value(work, 8, best * best)
         if place >= 0.0:
-            length = length_at(piece, place)
+            length = norm_at(piece, place)
             if length < best:
                 best, at = length, piece[15] + place * piece[16]
         close = max(CLOSE, _ROUNDING * math.sqrt(size))  # the accuracy that rounding allows
@@ -266,7 +266,7 @@ def distance_to_box(curve, b, part, floor, pieces, boxes):
 
 
 @jit
-def least_height_within(points, reach, floor, pieces):
+def least_height_in_cylinder(points, reach, floor, pieces):
     """Least |z| of a curve with control points (5, 3) while within ``reach`` of the z axis, and its place."""
     best, at, top, count, close = floor, -1.0, 0, 0, stack_curve(points, pieces)
     while top >= 0:
@@ -294,7 +294,7 @@ def least_height_within(points, reach, floor, pieces):
 
 
 @jit
-def least_length(curve, own, other, altitude, floor, pieces):
+def least_norm(curve, own, other, altitude, floor, pieces):
     """Least |r| of a curve with control points (5, 3) while one of two others is at z >= ``altitude``; its place."""
     best, at, top, count, close, rate = floor, -1.0, 0, 0, stack_curve(curve, pieces), 0.0
     for k in range(1, 5):
@@ -321,6 +321,6 @@ def least_length(curve, own, other, altitude, floor, pieces):
 
 
 @jit
-def write_basis(x, out):
+def write_bernstein(x, out):
     """Write the Bernstein polynomials (5,) of fourth degree at x."""
-    out[0], out[1], out[2], out[3], out[4] = basis_at(x)
+    out[0], out[1], out[2], out[3], out[4] = bernstein_at(x)

@@ -26,7 +26,7 @@ class VehicleClocks(NamedTuple):
     stuck: Ints  # (M, 3) vehicles, and from and until which tick they are stuck
 
 
-def same_clock(n: int) -> VehicleClocks:
+def shared_clock(n: int) -> VehicleClocks:
     """One clock for n vehicles."""
     none = np.zeros((0, 3), dtype=np.int64)
     return VehicleClocks(False, np.zeros(n, dtype=np.int64), np.zeros(n), 0.0, math.inf, none)

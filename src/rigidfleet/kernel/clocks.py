@@ -31,7 +31,7 @@ _BANDWIDTH = 5.0
 
 
 @jit
-def fill_rows(k, i, tick, flight, state):
+def fill_path_tables(k, i, tick, flight, state):
     """Fill the rows of vehicle i for tick k in the tables of its path, yaw, jerk and snap, by its own clock."""
     tables, rate, here = flight.tables, state.tau[i, RATE], k - flight.tables.first
     rows = tables.by_clock.shape[0]
@@ -53,7 +53,7 @@ def fill_rows(k, i, tick, flight, state):
 
 
 @jit
-def clock_of_neighbour(l, k, tick, mail):
+def neighbour_clock_offset(l, k, tick, mail):
     """What the clock of link l's sender differs by from the time at tick k [s] by its newest message, and its rate."""
     rate = mail.heard[l, CLOCK + 1]
     return mail.heard[l, CLOCK] + (k - mail.stamp[l]) * tick * (rate - 1.0), rate
@@ -73,7 +73,7 @@ def advance_clocks(k, tick, flight, state):
         own[OFF] += tick * (own[RATE] - 1.0)
         if k < clocks.late[i]:
             own[RATE] = 0.0
-            fill_rows(k, i, tick, flight, state)
+            fill_path_tables(k, i, tick, flight, state)
             continue
         target = min(max(2.0 - 2.0 * own[WORST] / clocks.wait, 0.0), 1.0)
         second = _BANDWIDTH * (_BANDWIDTH * (target - own[PACE]) - 2.0 * own[SLOPE])
@@ -82,12 +82,12 @@ def advance_clocks(k, tick, flight, state):
         pull, heard = 0.0, 0
         for l in range(net.first[i], net.first[i + 1]):
             if mail.stamp[l] >= 0 and k - mail.stamp[l] <= net.silence:
-                pull += clock_of_neighbour(l, k, tick, mail)[0] - own[OFF]
+                pull += neighbour_clock_offset(l, k, tick, mail)[0] - own[OFF]
                 heard += 1
         # Of the sum, the own clock counts at the end of the tick: stable at any gain
         pull *= clocks.gain / (1.0 + tick * clocks.gain * heard)
         own[RATE] = min(max(own[PACE] * (1.0 + clocks.drift[i]) + pull, 0.0), FASTEST)
-        fill_rows(k, i, tick, flight, state)
+        fill_path_tables(k, i, tick, flight, state)
 
 
 @jit
@@ -99,7 +99,7 @@ def post_clock(k, i, clocks, own, message):
 
 
 @jit
-def take_greatest_error(i, k, error, net, mail, own):
+def update_greatest_error(i, k, error, net, mail, own):
     """Take the error of vehicle i [m] at tick k, or a greater one that it has heard of.
 
     What was measured a time of silence ago counts nothing, and newer errors count more until then. So a great error
@@ -128,7 +128,7 @@ def follow_own_clock(i, k, t, p, w, flight, state):
     for l in range(net.first[i] - 1, net.first[i + 1]):
         j, ahead, pace = i, early, rate
         if l >= net.first[i]:  # a neighbour's slot is where its own clock has it
-            there, pace = clock_of_neighbour(l, k, tick, mail)
+            there, pace = neighbour_clock_offset(l, k, tick, mail)
             j, ahead = net.links[l, 1], early + (there - own[OFF] if mail.stamp[l] >= 0 else 0.0)
         for q in range(3 if tracks else 0):
             v, a = w.v_ref[j, q], w.a_ref[j, q] if early == 0.0 else 0.0
@@ -147,7 +147,7 @@ def follow_own_clock(i, k, t, p, w, flight, state):
             error += away * away
             own[SLOT + q], own[SLOT + 3 + q] = w.r_ref[i, q], w.v_ref[i, q]
             own[SLOT + 6 + q] = w.a_ref[i, q]
-    take_greatest_error(i, k, math.sqrt(error), net, mail, own)
+    update_greatest_error(i, k, math.sqrt(error), net, mail, own)
     stuck = False
     for n in range(flight.clocks.stuck.shape[0]):
         one = flight.clocks.stuck[n]
@@ -162,7 +162,7 @@ def follow_own_clock(i, k, t, p, w, flight, state):
 
 
 @jit
-def use_own_slots(p, w, state):
+def write_slots_by_own_clock(p, w, state):
     """Put into w the slot of each vehicle by its own clock: what others know of it is no longer needed."""
     for i in range(state.tau.shape[0] if p.control.kind == TRACKING else 0):
         for q in range(3):

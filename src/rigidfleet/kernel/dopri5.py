@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 
+from rigidfleet._common.renamed import getattr_of_earlier_names
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.dynamics import closed_loop
-from rigidfleet.kernel.gauge import write_force_gauge
+from rigidfleet.kernel.gauge import write_watched_forces
 from rigidfleet.kernel.records import (
     ACCEPTED,
     ATOL,
@@ -57,7 +58,7 @@ def forget_stages(k, first):
 
 
 @jit_inline
-def advance(k, stage, a, h, p):
+def write_stage_state(k, stage, a, h, p):
     """Write the state of a stage of p: y + h sum a[stage, s] k_s."""
     # All six terms at once, or the first: later stages have weight zero and finite values.
     a0, a1, a2 = h * a[stage, 0], h * a[stage, 1], h * a[stage, 2]
@@ -119,13 +120,13 @@ def step_to_knot(t, h, t_end, disturbance):
 
 
 @jit
-def keep_start(p, w, state):
+def record_start_forces(p, w, state):
     """Record the forces after a jump in the trail."""
-    write_force_gauge(p, w, state.trail.start)
+    write_watched_forces(p, w, state.trail.start)
 
 
 @jit
-def keep_step(t, h, p, w, state):
+def record_step(t, h, p, w, state):
     """Record a step in the next row of the trail: Bernstein coefficients of its extension, and the forces at its end.
 
     The terms are those of Hairer's form, y + x (rise + (1 - x) (bend + x (rest + (1 - x) twist))).
@@ -144,12 +145,12 @@ def keep_step(t, h, p, w, state):
         points[2, q] = y + 0.5 * rise + bend / 3.0 + (rest + twist) / 6.0
         points[3, q] = y + 0.75 * rise + 0.25 * (bend + rest)
         points[4, q] = K[TRIAL, q]
-    write_force_gauge(p, w, state.trail.gauge[row])
+    write_watched_forces(p, w, state.trail.gauge[row])
     state.count[TRAILED] += 1
 
 
 @jit_inline
-def keep_samples(t, h, t_new, times, samples, p, state):
+def write_step_samples(t, h, t_new, times, samples, p, state):
     """Write the states at the times in (t, t_new] by the step's continuous extension, from t [s] on, of length h."""
     K, count = state.K, state.count
     if count[SAMPLES] < times.shape[0] and times[count[SAMPLES]] <= t_new:
@@ -201,10 +202,10 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         stage = first
         # One call site of the right-hand side: stage 0 is the derivative at y itself.
         while stage < _STAGES:
-            advance(k, stage, _A, h, p)
+            write_stage_state(k, stage, _A, h, p)
             closed_loop(t + _C[stage] * h, trial, K[stage], p, w)
             if stage == 0 and capacity > 0:
-                keep_start(p, w, state)
+                record_start_forces(p, w, state)
             count[EVALUATIONS] += 1
             stage += 1
         squares = squared_errors(k, h, state.rtol, p)
@@ -224,8 +225,8 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
             continue
         t_new = t + h if t + h < t_end else t_end
         if capacity > 0:
-            keep_step(t, h, p, w, state)
-        keep_samples(t, h, t_new, times, samples, p, state)
+            record_step(t, h, p, w, state)
+        write_step_samples(t, h, t_new, times, samples, p, state)
         for q in range(k.shape[1]):
             k[STATE, q] = k[TRIAL, q]
             k[0, q] = k[_STAGES - 1, q]
@@ -245,3 +246,12 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         state.y[q] = y[q]
     clock[TIME], clock[NEXT_STEP], clock[LAST_ERROR] = t, h, last
     return status
+
+
+__getattr__ = getattr_of_earlier_names(
+    __name__,
+    keep_start="record_start_forces",
+    keep_samples="write_step_samples",
+    advance="write_stage_state",
+    keep_step="record_step",
+)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.kernel.clock_records import VehicleClocks, clocks_at_start, same_clock
+from rigidfleet.kernel.clock_records import VehicleClocks, clocks_at_start, shared_clock
 from rigidfleet.kernel.mail import Links, Mail, empty_mail, no_network
 from rigidfleet.kernel.problem import Workspace, padded, zeros
 from rigidfleet.kernel.records import NO_TRAIL, Trail
@@ -311,7 +311,7 @@ class SampledSegment(NamedTuple):
 _DECAY, _SPREAD, _ORIGIN = 10.11, 0.07668, -5.817
 
 
-def jet_speed(weight, density, radius, span, s, rr):
+def downwash_speed(weight, density, radius, span, s, rr):
     """Speed [m/s] of the air below a hovering quadrotor, along its z axis.
 
     At a distance s [m] below the vehicle along that axis and r beside it, with l the distance of opposite motors and
@@ -342,7 +342,7 @@ def jet_speed(weight, density, radius, span, s, rr):
 def quadrotor_arrays(vehicles: Sequence[VehicleDynamics], g: float = 9.81) -> Quadrotors:
     """Put vehicles into arrays."""
 
-    def rows(name: str) -> Floats:
+    def parameter_rows(name: str) -> Floats:
         return np.ascontiguousarray([getattr(v, name) for v in vehicles], dtype=float)
 
     names = set(Quadrotors._fields) - {"force", "unmix", "span", "point", "lost", "g"}
@@ -351,7 +351,7 @@ def quadrotor_arrays(vehicles: Sequence[VehicleDynamics], g: float = 9.81) -> Qu
         for v in vehicles
     ]
     return Quadrotors(
-        **{name: rows(name) for name in names},
+        **{name: parameter_rows(name) for name in names},
         force=np.array([v.thrust_at(v.speed) for v in vehicles]),
         unmix=np.array([v.allocation_matrix(g) for v in vehicles]),
         span=np.array([[gap.min(), gap.max()] for gap in gaps]),
@@ -393,7 +393,7 @@ def ideal_flight(
     """A flight in still air with exact sensing; see `SampledFlight`. Replace parts of it by ``_replace``."""
     n = len(vehicles.m)
     return SampledFlight(
-        vehicles, still_air(n), exact_sensing(n), no_network(n), same_clock(n),
+        vehicles, still_air(n), exact_sensing(n), no_network(n), shared_clock(n),
         Guidance(np.zeros(n), np.zeros((n, 3))), empty_inputs(n), no_commands(n), start, h, steps, every,
     )  # fmt: skip
 

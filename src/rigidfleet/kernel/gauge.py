@@ -7,7 +7,7 @@ from rigidfleet.kernel.constraint import find_multipliers
 
 
 @jit
-def write_force_gauge(p, w, values):
+def write_watched_forces(p, w, values):
     """Thrust, acceleration and constraint force of each agent; tension and constraint of each edge; into (3N + 2m,).
 
     If there is room for (5N + 2m,), also the horizontal and the vertical acceleration of each agent.

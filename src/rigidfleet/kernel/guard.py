@@ -7,7 +7,7 @@ after the other then takes what it wants, if its motion over the tick and its st
 from what the others do at present; else the nearest of some fixed accelerations that does; else it brakes. The proof is
 in docs/avoidance.md.
 
-A quadrotor is led by a point ahead of it that obeys at once (`move_to_obedient_point`), and keeps its distances with
+A quadrotor is led by a point ahead of it that obeys at once (`move_to_lag_free_point`), and keeps its distances with
 the hull of this point, its stop point and what comes behind: while it brakes, this hull only shrinks, too.
 
 Vehicles or obstacles that are nearer than they should be must not come nearer still.
@@ -34,16 +34,16 @@ from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
 from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.moving import (
-    braking_acceleration_beside,
-    braking_limit_beside,
+    braking_relative_to_obstacle,
     is_obstacle_known,
-    margin_beside_moving,
     miss_distance,
+    moving_obstacle_margin,
+    relative_braking_limit,
+    required_obstacle_distance,
     steer_round_obstacles,
-    surplus_beside_moving,
     update_tracks,
     way_to_rest,
-    write_stop_beside,
+    write_relative_stop,
 )
 from rigidfleet.kernel.rigid_body import attitude_matrix
 from rigidfleet.kernel.sampled_flight import write_measured_states
@@ -269,7 +269,7 @@ def greatest_length(x):
 
 
 @jit
-def greatest_move_apart(r, a):
+def greatest_relative_move(r, a):
     """Greatest way [m] of a vehicle since neighbours were listed, beside the way that all have gone."""
     # What all have gone together changes no distance: a fleet that travels keeps its lists.
     n, farthest = a.b.shape[0], 0.0
@@ -293,7 +293,7 @@ def update_neighbours(r, v, lost, a):
     due = a.count[LISTED] == 0 or fastest > a.span[1] or hardest > a.span[2]
     # Nor for speeds far below those for which it was made
     due = due or 2.5 * fastest + _LEAST_SPEED < 0.8 * a.span[1]
-    if not (due or 2.0 * greatest_move_apart(r, a) > a.span[0]):
+    if not (due or 2.0 * greatest_relative_move(r, a) > a.span[0]):
         return True
     speed, hard = (1.0 + _FASTER) * fastest + _LEAST_SPEED, (1.0 + _FASTER) * hardest + 1.0
     way = interaction_range(speed, hard, a)
@@ -326,15 +326,18 @@ def is_alone(i, a):
 
 
 @jit
-def set_distance_floor_beside(t, i, o, r, v, closest, a):
+def set_obstacle_distance_floor(t, i, o, r, v, closest, a):
     """Find the distance that the relative stop segment of vehicle i keeps from obstacle o, which moves.
 
     Returns the least by which such a segment exceeds what it needs so far, at most 0; `threat` is its obstacle.
     """
     if not is_obstacle_known(o, a):
         return closest
-    stop, speed = write_stop_beside(i, o, r, v, a)
-    need, way = margin_beside_moving(i, o, speed, braking_limit_beside(i, o, a), a), a.shifted
+    stop, speed = write_relative_stop(i, o, r, v, a)
+    need, way = (
+        required_obstacle_distance(i, o, speed, relative_braking_limit(i, o, a), a),
+        a.shifted,
+    )
     apart = point_to_obstacle(way[0, 0], way[0, 1], way[0, 2], o, a.solids, a.normal) - stop
     a.walls[i, o] = need
     if a.threat[i] < 0:  # also one that is still far: a single tick may bring it near
@@ -386,7 +389,7 @@ def set_distance_floors(t, r, v, lost, a):
         a.threat[i], a.late[i], closest = -1, 0.0, 0.0
         for o in range(a.solids.kind.shape[0]):
             if a.sight.moves[o] != 0:
-                closest = set_distance_floor_beside(t, i, o, r[i], v[i], closest, a)
+                closest = set_obstacle_distance_floor(t, i, o, r[i], v[i], closest, a)
                 a.late[i] = closest
                 continue
             need = a.reach[i] + a.spare[i]
@@ -412,7 +415,7 @@ def is_safe(i, r, v, far, a):
 
 
 @jit
-def is_pushed(i, a):
+def is_barrier_active(i, a):
     """Whether barriers push vehicle i."""
     push = a.known[2, i]
     return push[0] * push[0] + push[1] * push[1] + push[2] * push[2] > 0.0
@@ -424,14 +427,14 @@ def propose_candidate(i, k, v, a, c):
     last = a.candidates.shape[0] + 1
     if k == 0:
         c[0], c[1], c[2] = a.wanted[i, 0], a.wanted[i, 1], a.wanted[i, 2]
-        if a.soft[i] > 0.0 and a.overruled[i] == 0 and not is_pushed(i, a):
+        if a.soft[i] > 0.0 and a.overruled[i] == 0 and not is_barrier_active(i, a):
             for q in range(3):
-                c[q] = choice_to_obey_at_once(i, q, a)
+                c[q] = lag_compensating_choice(i, q, a)
     elif k < last:
         for q in range(3):
             c[q] = a.b[i] * a.candidates[k - 1, q]
     else:
-        braking_acceleration_beside(i, a.threat[i], v, a, c)
+        braking_relative_to_obstacle(i, a.threat[i], v, a, c)
 
 
 @jit
@@ -442,7 +445,7 @@ def least_margin_if_braking(i, r, v, late, a):
     if late:
         return miss_distance(r[i], v[i], c, a)
     predict_motion(i, r[i], v[i], c, a, a.trial)
-    return surplus_beside_moving(i, v[i], a)
+    return moving_obstacle_margin(i, v[i], a)
 
 
 @jit
@@ -466,7 +469,7 @@ def choose_acceleration(i, r, v, a):
         far = predict_motion(i, r[i], v[i], c, a, a.trial)
         if not is_safe(i, r, v, far, a):
             continue
-        room = miss_distance(r[i], v[i], c, a) if late else surplus_beside_moving(i, v[i], a)
+        room = miss_distance(r[i], v[i], c, a) if late else moving_obstacle_margin(i, v[i], a)
         if late or room < 0.0:
             if room > most:
                 most, second = room, k
@@ -515,16 +518,16 @@ def wanted_acceleration(i, state, a):
             a.requested[i, q] = a.wanted[i, q]
             if not a.commanded[i, q] < math.inf:
                 a.commanded[i, q] = a.requested[i, q]
-            a.wanted[i, q] = choice_to_obey_at_once(i, q, a)
+            a.wanted[i, q] = lag_compensating_choice(i, q, a)
         limit_thrust(i, a)
         for q in range(3):
-            off = max(off, abs(a.wanted[i, q] - choice_to_obey_at_once(i, q, a)))
+            off = max(off, abs(a.wanted[i, q] - lag_compensating_choice(i, q, a)))
         if off < _ROUNDING:
             a.overruled[i] = 0
 
 
 @jit
-def choice_to_obey_at_once(i, q, a):
+def lag_compensating_choice(i, q, a):
     """The choice, along axis q, that has vehicle i follow what it is asked for at once."""
     return a.commanded[i, q] + (1.0 + a.ahead[i, q, 2] / a.period) * (
         a.requested[i, q] - a.commanded[i, q]
@@ -532,7 +535,7 @@ def choice_to_obey_at_once(i, q, a):
 
 
 @jit
-def move_to_obedient_point(i, vehicles, state, r, v, a):
+def move_to_lag_free_point(i, vehicles, state, r, v, a):
     """Lead r and v (3,) of vehicle i to the point that obeys the guard at once; keeps the points behind it.
 
     From a command u to the acceleration, attitude and motors act as u = a + a1 da/dt + a2 d2a/dt2 + ..., so that
@@ -567,7 +570,7 @@ def guard_forces(p, w, flight, state, a):
     for i in range(n):
         wanted_acceleration(i, state, a)
         if a.soft[i] > 0.0:
-            move_to_obedient_point(i, flight.vehicles, state, r[i], v[i], a)
+            move_to_lag_free_point(i, flight.vehicles, state, r[i], v[i], a)
         else:
             for q in range(3):
                 a.ways[i, 4, q] = a.ways[i, 5, q] = r[i, q]
@@ -587,7 +590,7 @@ def guard_forces(p, w, flight, state, a):
     changed = a.filtered and filter_accelerations(t, r, v, lost, p, w, a)
     for k in range(n):
         i = (k + a.count[TICKS]) % n  # each comes first in turn
-        if changed and is_pushed(i, a):
+        if changed and is_barrier_active(i, a):
             state.layers[i] = ACTS[BARRIER]
         if lost[i]:
             continue

@@ -23,18 +23,18 @@ from rigidfleet.kernel.bernstein import (
     CLOSE,
     ball_radius,
     distance_to_box,
-    least_height_within,
-    least_length,
+    least_height_in_cylinder,
+    least_norm,
+    least_norm_of_curve,
     least_polynomial_value,
-    length_at,
+    norm_at,
     point_at,
-    shortest_length,
-    squared_length,
+    squared_norm_coefficients,
     tangent_of_box,
-    write_basis,
+    write_bernstein,
 )
 from rigidfleet.kernel.compiler.jit import jit
-from rigidfleet.kernel.gauge import write_force_gauge
+from rigidfleet.kernel.gauge import write_watched_forces
 from rigidfleet.kernel.outside import call_recorder
 from rigidfleet.kernel.records import (
     ACCELERATION,
@@ -88,7 +88,7 @@ def take_if_worse(kind, key, t, first, second, monitor):
 
 
 @jit
-def quaternion_bounds(points, p):
+def quaternion_rate_and_length(points, p):
     """Greatest rate, over a step, and least length of the quaternion of the body axes, by its control points."""
     first = 6 * p.vehicles.m.shape[0] + p.graph.edges.shape[0]
     fastest, least = 0.0, math.inf
@@ -106,7 +106,7 @@ def rotation_bound(points, p):
     """Upper bound of the rotation [rad] of the axes of the states over a step: 0 in the inertial formulation."""
     if not p.body_formulation:
         return 0.0
-    rate, length = quaternion_bounds(points, p)
+    rate, length = quaternion_rate_and_length(points, p)
     return 2.0 * rate / max(length, 1e-3)
 
 
@@ -117,22 +117,22 @@ def count_pieces(angle):
 
 
 @jit
-def find_attitudes(points, part, parts, p, monitor):
+def find_body_frames(points, part, parts, p, monitor):
     """Attitude, centre and its velocity at five knots of a piece of a step, in the body formulation."""
     first = 6 * p.vehicles.m.shape[0] + p.graph.edges.shape[0]
     quaternion = monitor.scratch[0]
     for k in range(5):
         basis = monitor.basis[k]
-        write_basis((part + KNOTS[k]) / parts, basis)
+        write_bernstein((part + KNOTS[k]) / parts, basis)
         for s in range(4):
-            quaternion[s] = value_of_column(basis, points, first + s)
+            quaternion[s] = bernstein_column_value(basis, points, first + s)
         for s in range(6):
-            monitor.centres[k, s] = value_of_column(basis, points, first + 4 + s)
+            monitor.centres[k, s] = bernstein_column_value(basis, points, first + 4 + s)
         attitude_matrix(quaternion, monitor.attitudes[k])
 
 
 @jit
-def value_of_column(basis, points, q):
+def bernstein_column_value(basis, points, q):
     """Column q of control points (5, n) where a curve has the Bernstein polynomials ``basis`` (5,)."""
     value = 0.0
     for k in range(5):
@@ -141,7 +141,7 @@ def value_of_column(basis, points, q):
 
 
 @jit
-def world_points(points, i, moving, p, monitor, out):
+def world_control_points(points, i, moving, p, monitor, out):
     """Control points (5, 3) of agent i's position in the world, or of its velocity (``moving`` 1)."""
     n = p.vehicles.m.shape[0]
     first = 3 * i + 3 * n * moving
@@ -154,7 +154,7 @@ def world_points(points, i, moving, p, monitor, out):
     for k in range(5):
         T = monitor.attitudes[k]
         for q in range(3):
-            in_body[q] = value_of_column(monitor.basis[k], points, first + q)
+            in_body[q] = bernstein_column_value(monitor.basis[k], points, first + q)
         for q in range(3):
             at_knots[k, q] = monitor.centres[k, 3 * moving + q]
             for s in range(3):
@@ -170,7 +170,7 @@ def world_points(points, i, moving, p, monitor, out):
 
 
 @jit
-def point_from_mean(points, k, i, mean):
+def control_point_from_mean(points, k, i, mean):
     """Control point k of agent i, from the mean of those of the agents that are monitored."""
     return (
         points[k, 3 * i] - mean[k, 0],
@@ -204,8 +204,8 @@ def rotation_over_step(points, mean, monitor):
     xx = xy = xz = yy = yz = zz = moment_x = moment_y = moment_z = 0.0
     for i in range(monitor.left.shape[0]):
         if monitor.left[i]:
-            x0, y0, z0 = point_from_mean(points, 0, i, mean)
-            x1, y1, z1 = point_from_mean(points, 4, i, mean)
+            x0, y0, z0 = control_point_from_mean(points, 0, i, mean)
+            x1, y1, z1 = control_point_from_mean(points, 4, i, mean)
             x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (z0 + z1)
             dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
             xx, yy, zz = xx + y * y + z * z, yy + x * x + z * z, zz + x * x + y * y
@@ -226,7 +226,7 @@ def rotation_over_step(points, mean, monitor):
 
 
 @jit
-def bound_changes(p, state, monitor):
+def bound_distance_changes(p, state, monitor):
     """Bounds [m] of the change of any distance over the trail's first step, in space and as seen from above.
 
     They are written into ``monitor.moves``. With r_i' = any rigid motion + u_i, the rate of a distance is at most
@@ -240,10 +240,10 @@ def bound_changes(p, state, monitor):
     for i in range(monitor.left.shape[0]):
         if not monitor.left[i]:
             continue
-        x, y, z = point_from_mean(points, 0, i, mean)
+        x, y, z = control_point_from_mean(points, 0, i, mean)
         before_x = before_y = before_z = 0.0
         for k in range(5):
-            next_x, next_y, next_z = point_from_mean(points, min(k + 1, 4), i, mean)
+            next_x, next_y, next_z = control_point_from_mean(points, min(k + 1, 4), i, mean)
             after_x, after_y, after_z = next_x - x, next_y - y, next_z - z
             # The rate of a quartic has, in quartic form, k (x_k - x_k-1) + (4 - k) (x_k+1 - x_k) as coefficients; the
             # rotation takes its cross product with the place from it.
@@ -258,7 +258,7 @@ def bound_changes(p, state, monitor):
     if p.body_formulation:
         # The axes turn as well, and where the vertical is in them is not asked: any rotation may tilt. A quaternion
         # between its control points may be shorter than they are, hence the tenth.
-        rate, length = quaternion_bounds(points, p)
+        rate, length = quaternion_rate_and_length(points, p)
         turn = math.sqrt(turn_x * turn_x + turn_y * turn_y + turn_z * turn_z)
         tilt = 2.0 * rate / max(length - 0.1, 0.1) + turn
     # Of two agents, each may move by its part, and tilting moves each by at most its distance from the mean.
@@ -317,11 +317,11 @@ def watch_pairs(kind, pairs, points, t, h, monitor):
                 else:
                     curve[s, q] = points[s, 3 * i + q] - points[s, 3 * j + q]
         if below:
-            value, at = least_height_within(curve, radii, floor, monitor.pieces)
+            value, at = least_height_in_cylinder(curve, radii, floor, monitor.pieces)
         elif flying:
-            value, at = least_length(curve, own, other, monitor.altitude, floor, monitor.pieces)
+            value, at = least_norm(curve, own, other, monitor.altitude, floor, monitor.pieces)
         else:
-            value, at = shortest_length(curve, floor, monitor.work, monitor.pieces)
+            value, at = least_norm_of_curve(curve, floor, monitor.work, monitor.pieces)
         if at >= 0.0:
             take_if_worse(kind, value - radii, t + at * h, i, j, monitor)
 
@@ -352,14 +352,14 @@ def watch_speed(kind, curve, low, high, t, h, i, monitor):
     greatest = -monitor.worst[kind]  # -inf at first
     if fastest <= greatest * abs(greatest):
         return
-    squared_length(piece, -1.0, monitor.work[0])
+    squared_norm_coefficients(piece, -1.0, monitor.work[0])
     _, at = least_polynomial_value(monitor.work, 8, -greatest * abs(greatest))
     if at >= 0.0:
-        take_if_worse(kind, -length_at(piece, at), t + at * h, i, -1, monitor)
+        take_if_worse(kind, -norm_at(piece, at), t + at * h, i, -1, monitor)
 
 
 @jit
-def clearance_of_interest(i, monitor):
+def clearance_to_beat(i, monitor):
     """Clearance of agent i from which on it is worse than what is stored."""
     # A clearance is stored under three names, and is of no interest only if it is worse than none of them.
     own = monitor.worst[FLYING]
@@ -404,7 +404,7 @@ def watch_obstacles(i, curve, t, h, last, monitor):
     x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], monitor.balls[i, 3]
     for b in range(monitor.boxes.shape[0]):
         box = monitor.boxes[b]
-        floor = clearance_of_interest(i, monitor) + radius
+        floor = clearance_to_beat(i, monitor) + radius
         far = max(0.0, box[0] - x, x - box[3]) ** 2 + max(0.0, box[1] - y, y - box[4]) ** 2
         far += max(0.0, box[2] - z, z - box[5]) ** 2
         if far >= (floor + span) ** 2 and floor + span > 0.0:  # far from the whole obstacle
@@ -427,11 +427,11 @@ def watch_obstacles(i, curve, t, h, last, monitor):
 def watch_distances(first, end, p, state, monitor):
     """Take the extremes of distances and speeds over the steps of a trail from ``first`` to before ``end``."""
     for step in range(first, end):
-        watch_step(step, p, state, monitor)
+        watch_step_distances(step, p, state, monitor)
 
 
 @jit
-def watch_step(step, p, state, monitor):
+def watch_step_distances(step, p, state, monitor):
     """Take the extremes of distances and speeds over one step of the trail."""
     trail, row = state.trail, trail_row_of(step, state)
     points, t, h = trail.points[row], trail.clock[row, 0], trail.clock[row, 1]
@@ -444,18 +444,18 @@ def watch_step(step, p, state, monitor):
     for part in range(parts):
         start = t + part * h
         if p.body_formulation:
-            find_attitudes(points, part, parts, p, monitor)
+            find_body_frames(points, part, parts, p, monitor)
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
                 continue
             curve = monitor.curve
-            world_points(points, i, 1, p, monitor, curve)
+            world_control_points(points, i, 1, p, monitor, curve)
             watch_speed(SPEED, curve, 0, 3, start, h, i, monitor)
             if monitor.worst[HORIZONTAL_SPEED] > -math.inf:
                 watch_speed(HORIZONTAL_SPEED, curve, 0, 2, start, h, i, monitor)
                 watch_speed(VERTICAL_SPEED, curve, 2, 3, start, h, i, monitor)
             curve = monitor.places[i]
-            world_points(points, i, 0, p, monitor, curve)
+            world_control_points(points, i, 0, p, monitor, curve)
             enclose_points(curve, monitor.balls[i])
             watch_coordinate(LOWEST, curve, 2, 1.0, 0.0, start, h, i, monitor)
             watch_coordinate(HIGHEST, curve, 2, -1.0, 0.0, start, h, i, monitor)
@@ -475,7 +475,7 @@ def watch_step(step, p, state, monitor):
 
 
 @jit
-def take_forces(values, t, p, monitor):
+def take_force_extremes(values, t, p, monitor):
     """Take the forces of a gauge (3N + 2m or 5N + 2m,) at time t [s] into account."""
     n, edges = p.vehicles.m.shape[0], p.graph.edges
     m = edges.shape[0]
@@ -524,18 +524,18 @@ def evaluate_forces(t, step, p, w, state, monitor, values):
     trail, row = state.trail, trail_row_of(step, state)
     x = (t - trail.clock[row, 0]) / trail.clock[row, 1]
     basis, y = monitor.basis[0], monitor.states[0]
-    write_basis(min(max(x, 0.0), 1.0), basis)
+    write_bernstein(min(max(x, 0.0), 1.0), basis)
     for q in range(y.shape[0]):
-        y[q] = value_of_column(basis, trail.points[row], q)
+        y[q] = bernstein_column_value(basis, trail.points[row], q)
     monitor.time[0] = t
     # The recorder contains the compiled law; without rows to write, it leaves all values in the workspace.
     call_recorder(monitor.recorder, p, w, monitor.segment, monitor.record)
-    write_force_gauge(p, w, values)
-    take_forces(values, t, p, monitor)
+    write_watched_forces(p, w, values)
+    take_force_extremes(values, t, p, monitor)
 
 
 @jit
-def expected_excess(c, a, b, v, ta, tb, tc, p, monitor):
+def parabola_excess(c, a, b, v, ta, tb, tc, p, monitor):
     """Expected excess over the worst value, and its time, from the parabola through |values| a, b, v at ta < tb < tc.
 
     The excess of entry c is a share of the worst value, with the rise to the top of the parabola counted twice. It is
@@ -577,7 +577,7 @@ def search_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor
     for c in range(middle.shape[0]):
         a, b, v = abs(before[c]), abs(middle[c]), abs(after[c])
         if b >= a and b >= v:
-            more, x = expected_excess(c, a, b, v, ta, tb, tc, p, monitor)
+            more, x = parabola_excess(c, a, b, v, ta, tb, tc, p, monitor)
             if more > best:
                 best, top = more, x
     if best == 0.0:
@@ -604,7 +604,7 @@ def search_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor
             for c in range(middle.shape[0]):
                 a, b, v = abs(values[i, c]), abs(values[j, c]), abs(values[l, c])
                 if b >= a and b >= v:
-                    more, x = expected_excess(c, a, b, v, at[i], at[j], at[l], p, monitor)
+                    more, x = parabola_excess(c, a, b, v, at[i], at[j], at[l], p, monitor)
                     if more > best:
                         best, top = more, x
         if best == 0.0:
@@ -625,7 +625,7 @@ def step_end_time(step, state):
 
 
 @jit
-def watch_lone_step(step, before, after, p, w, state, monitor):
+def watch_lone_step_forces(step, before, after, p, w, state, monitor):
     """Search a step that has no neighbour, because of a jump or the end."""
     start, end = state.trail.clock[trail_row_of(step, state), 0], step_end_time(step, state)
     middle, values = 0.5 * (start + end), monitor.gauge[1]
@@ -650,16 +650,16 @@ def watch_forces(last, p, w, state, monitor):
         if step == 0 and new:
             for c in range(before.shape[0]):
                 before[c] = trail.start[c]
-            take_forces(before, start, p, monitor)
+            take_force_extremes(before, start, p, monitor)
         if new:
-            take_forces(after, end, p, monitor)
+            take_force_extremes(after, end, p, monitor)
         if step == 0 and new:
-            watch_lone_step(0, before, after, p, w, state, monitor)
+            watch_lone_step_forces(0, before, after, p, w, state, monitor)
         if step + 1 < steps:
             then, until = trail.gauge[trail_row_of(step + 1, state)], step_end_time(step + 1, state)
             search_between(earlier, after, then, step, start, end, until, p, w, state, monitor)
         elif last and (step > 0 or not new):
-            watch_lone_step(step, earlier, after, p, w, state, monitor)
+            watch_lone_step_forces(step, earlier, after, p, w, state, monitor)
     if last or steps == 0:
         monitor.count[STAYED], state.count[TRAILED] = 0, 0
     else:

@@ -78,7 +78,7 @@ def obstacle_velocity(t, o, solids):
 
 
 @jit
-def in_sight(o, x, y, z, r, lost, a):
+def is_in_sight(o, x, y, z, r, lost, a):
     """Whether any vehicle is within sensing range of obstacle o, displaced by x, y, z [m]."""
     for i in range(r.shape[0]):
         if not lost[i]:
@@ -124,7 +124,7 @@ def update_tracks(t, r, lost, a):
         u, v, w = obstacle_velocity(t + 0.5 * T, o, a.solids)
         if s.known[o] != UNKNOWN:
             predict_track(o, T, s)
-        if not s.reach < math.inf or in_sight(o, x, y, z, r, lost, a):
+        if not s.reach < math.inf or is_in_sight(o, x, y, z, r, lost, a):
             use_measurement(o, k, x, y, z, u, v, w, a)
             s.known[o] = FOLLOWED
         if s.known[o] == UNKNOWN:
@@ -146,7 +146,7 @@ def is_obstacle_known(o, a):
 
 
 @jit
-def braking_limit_beside(i, o, a):
+def relative_braking_limit(i, o, a):
     """Acceleration [m/s^2] with which vehicle i can always brake relative to obstacle o, which moves."""
     x = a.sight.track[o]
     speed = math.sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5])
@@ -155,7 +155,7 @@ def braking_limit_beside(i, o, a):
 
 
 @jit
-def braking_acceleration_beside(i, o, v, a, out):
+def braking_relative_to_obstacle(i, o, v, a, out):
     """Acceleration (3,) that brakes vehicle i from a velocity v (3,) relative to obstacle o, straight, with drag.
 
     It bears the drag that the vehicle has at the obstacle's velocity, so that what is left acts on the relative one.
@@ -165,7 +165,7 @@ def braking_acceleration_beside(i, o, v, a, out):
     for q in range(3):
         speed += (v[q] - x[3 + q]) ** 2
     speed = math.sqrt(speed)
-    size = min(braking_limit_beside(i, o, a), speed * E / first) / max(speed, 1e-12)
+    size = min(relative_braking_limit(i, o, a), speed * E / first) / max(speed, 1e-12)
     for q in range(3):
         out[q] = (1.0 - E) / first * x[3 + q] - size * (v[q] - x[3 + q])
 
@@ -181,14 +181,14 @@ def way_to_rest(u, b, lag, T):
 
 
 @jit
-def margin_beside_moving(i, o, speed, b, a):
+def required_obstacle_distance(i, o, speed, b, a):
     """Distance [m] from obstacle o, which moves, to keep by the stop segment of vehicle i at a relative speed."""
     bound = a.sight.bound[o]
     return a.reach[i] + a.spare[i] + bound[0] + bound[1] * speed / b
 
 
 @jit
-def write_stop_beside(i, o, r, v, a):
+def write_relative_stop(i, o, r, v, a):
     """Write the relative stop segment of vehicle i to ``shifted`` 0 and 2; returns its length and relative speed."""
     x, out = a.sight.track[o], a.shifted
     speed = 0.0
@@ -196,14 +196,14 @@ def write_stop_beside(i, o, r, v, a):
         out[0, q], out[3, q] = r[q] - x[q] - a.lead[i, q] * x[3 + q], v[q] - x[3 + q]
         speed += out[3, q] * out[3, q]
     speed = math.sqrt(speed)
-    stop = way_to_rest(speed, braking_limit_beside(i, o, a), a.lag[i], a.period)
+    stop = way_to_rest(speed, relative_braking_limit(i, o, a), a.lag[i], a.period)
     for q in range(3):
         out[2, q] = out[0, q] + stop / max(speed, 1e-12) * out[3, q]
     return stop, speed
 
 
 @jit
-def surplus_beside_moving(i, v, a):
+def moving_obstacle_margin(i, v, a):
     """By how much the candidate of vehicle i keeps its distances from obstacles that move [m]; infinite if it is far.
 
     The candidate is ``trial``, the velocity before it v (3,).
@@ -224,7 +224,7 @@ def surplus_beside_moving(i, v, a):
             after += end * end
             rise += way[4, q] * way[4, q]
         before, after = math.sqrt(before), math.sqrt(after)
-        stop = way_to_rest(after, braking_limit_beside(i, o, a), a.lag[i], T)
+        stop = way_to_rest(after, relative_braking_limit(i, o, a), a.lag[i], T)
         far = T * (before + 0.5 * T * math.sqrt(rise)) + stop
         if point_to_obstacle(out[0, 0], out[0, 1], out[0, 2], o, a.solids, normal) - far >= floor:
             continue

@@ -39,7 +39,7 @@ _UNIT, _RIGHT, _UNKNOWN, _LINK = 0, 3, 4, 5
 
 
 @jit
-def estimate_acceleration(i, dt, v, net, mail):
+def observe_disturbance(i, dt, v, net, mail):
     """Estimate what accelerates vehicle i beside its desired force, from its velocity v (3,), for the last dt [s].
 
     An observer of second order: the velocity that the estimate foretells is corrected by what is measured.
@@ -53,7 +53,7 @@ def estimate_acceleration(i, dt, v, net, mail):
 
 
 @jit
-def draw_integrals_together(l, messages, mail):
+def synchronise_edge_integral(l, messages, mail):
     """Draw i's integral of the edge of link l towards j's, both as when the newest message was sent."""
     share = mail.multiplier.shape[1] - 1
     part = min(TOGETHER, UNDER_WAY / max(messages, 1.0))
@@ -73,7 +73,7 @@ def fade_silent_edges(i, k, ticks, net, mail):
         if mail.edge[l] == NONE or mail.stamp[l] < 0:
             mail.grip[l] = 0.0
         elif mail.fresh[l]:
-            draw_integrals_together(l, (k - mail.stamp[l]) / net.every, mail)
+            synchronise_edge_integral(l, (k - mail.stamp[l]) / net.every, mail)
         mail.fresh[l] = False
 
 
@@ -139,7 +139,7 @@ def equation_of_edge(row, l, k, dt, tick, p, w, net, mail, saturated):
 
 
 @jit
-def solve_own_edges(i, k, dt, tick, p, w, net, mail, saturated):
+def solve_own_constraint_force(i, k, dt, tick, p, w, net, mail, saturated):
     """Constraint force of vehicle i, into w.f_C[i] [N], from the slots, distances and input force in w.
 
     Of other vehicles, only messages are read. With damping mu, each iterate of the law (`constraint.solve_multipliers`)

@@ -15,13 +15,13 @@ from rigidfleet.kernel.bernstein import ball_radius, distance_to_box, point_at
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import compiled_copy, jit
 from rigidfleet.kernel.monitor import (
-    clearance_of_interest,
+    clearance_to_beat,
     count_pieces,
-    find_attitudes,
+    find_body_frames,
     note_departure,
     rotation_bound,
     take_clearance,
-    world_points,
+    world_control_points,
 )
 from rigidfleet.solids.distance import (
     box_distance,
@@ -31,7 +31,7 @@ from rigidfleet.solids.distance import (
     outward_normal,
     signed_distance,
     solid_displacement,
-    triangle_to_point,
+    vector_from_triangle,
 )
 from rigidfleet.solids.records import HEIGHTS
 
@@ -45,7 +45,7 @@ def tangent_of_solid(x, y, z, b, triangle, s):
     if triangle < 0:
         nx, ny, nz = outward_normal(x, y, z, b, s)
         return signed_distance(x, y, z, b, s), nx, ny, nz
-    nx, ny, nz, squared = triangle_to_point(x, y, z, s.triangles[triangle])
+    nx, ny, nz, squared = vector_from_triangle(x, y, z, s.triangles[triangle])
     away = math.sqrt(squared)
     if away == 0.0:
         return 0.0, 0.0, 0.0, 0.0
@@ -95,7 +95,7 @@ def cut_curve(curve, start, end, work, out):
 
 
 @jit
-def curve_in_axes(curve, t, h, b, s, out):
+def curve_in_solid_axes(curve, t, h, b, s, out):
     """Control points (5, 3) in the axes of solid b, which moves straight from t to t + h."""
     x0, y0, z0 = solid_displacement(t, b, s)
     x1, y1, z1 = solid_displacement(t + h, b, s)
@@ -108,7 +108,7 @@ def curve_in_axes(curve, t, h, b, s, out):
 
 
 @jit
-def point_in_axes(x, y, z, t, b, s):
+def point_in_solid_axes(x, y, z, t, b, s):
     """Coordinates of a point of the world in the axes of solid b at time t [s]."""
     u, v, w = solid_displacement(t, b, s)
     return in_own_axes(x - u, y - v, z - w, b, s)
@@ -131,11 +131,11 @@ def watch_solid(i, b, curve, t, h, s, monitor):
             end = min(stop, max((s.times[way] - t) / h, start + _SHORTEST))
         if start > 0.0 or end < 1.0:
             cut_curve(curve, start, end, monitor.scratch[2], part)
-            curve_in_axes(part, t + start * h, (end - start) * h, b, s, own)
+            curve_in_solid_axes(part, t + start * h, (end - start) * h, b, s, own)
         else:
-            curve_in_axes(curve, t, h, b, s, own)
+            curve_in_solid_axes(curve, t, h, b, s, own)
         x, y, z = own[2, 0], own[2, 1], own[2, 2]
-        floor = clearance_of_interest(i, monitor) + radius
+        floor = clearance_to_beat(i, monitor) + radius
         if not (floor < math.inf and distance_bound(x, y, z, b, s) - ball_radius(own) >= floor):
             if s.kind[b] == HEIGHTS:
                 value, at = distance_to_heights(own, b, floor, monitor.pieces, s)
@@ -166,7 +166,7 @@ def watch_landing(i, curve, t, s, monitor):
         if not is_present(t, b, s):
             continue
         u, v, w = curve[4, 0], curve[4, 1], curve[4, 2]
-        x, y, z = point_in_axes(u, v, w, t, b, s)
+        x, y, z = point_in_solid_axes(u, v, w, t, b, s)
         near = monitor.radius[i] + monitor.pad
         if distance_bound(x, y, z, b, s) > near or signed_distance(x, y, z, b, s) > near:
             continue
@@ -183,11 +183,11 @@ def watch_step(points, start, length, p, s, monitor):
     for part in range(parts):
         t = start + part * h
         if p.body_formulation:
-            find_attitudes(points, part, parts, p, monitor)
+            find_body_frames(points, part, parts, p, monitor)
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
                 continue
-            world_points(points, i, 0, p, monitor, curve)
+            world_control_points(points, i, 0, p, monitor, curve)
             for b in range(s.kind.shape[0]):
                 watch_solid(i, b, curve, t, h, s, monitor)
             if part == parts - 1:

@@ -71,7 +71,7 @@ class Trail(NamedTuple):
 
     clock: Annotated[Floats, Extents((None, 2))]  # start [s], length [s]
     points: Annotated[Floats, Extents((None, 5, None))]  # (S, 5, n)
-    gauge: Floats  # (S, 3N + 2m or 5N + 2m) at the end, see `gauge.write_force_gauge`
+    gauge: Floats  # (S, 3N + 2m or 5N + 2m) at the end, see `gauge.write_watched_forces`
     start: Floats  # (3N + 2m or 5N + 2m,) at the start of the first step, after a jump
 
 
@@ -109,7 +109,7 @@ class Monitor(NamedTuple):
     struck: Pairs  # of a lost agent and one still flying
     columns: Pairs  # that may fly one below the other
     count: Ints  # (1,) see `STAYED`
-    moves: Floats  # (2,) bounds of the change of any distance [m], see `monitor.bound_changes`
+    moves: Floats  # (2,) bounds of the change of any distance [m], see `monitor.bound_distance_changes`
     recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
     segment: int
     record: int

@@ -16,7 +16,7 @@ from rigidfleet.kernel.clocks import (
     drop_constraint_force,
     follow_own_clock,
     post_clock,
-    use_own_slots,
+    write_slots_by_own_clock,
 )
 from rigidfleet.kernel.compiler.calls import call_external, call_recorder
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
@@ -44,10 +44,10 @@ from rigidfleet.kernel.fleet import (
 )
 from rigidfleet.kernel.mail import NONE, PULL, SATURATED, SLOT, TRACKED, A, R, U, V
 from rigidfleet.kernel.neighbours import (
-    estimate_acceleration,
     extrapolate_neighbour,
     fade_silent_edges,
-    solve_own_edges,
+    observe_disturbance,
+    solve_own_constraint_force,
 )
 from rigidfleet.kernel.network import receive, send
 from rigidfleet.kernel.problem import SHAPE, TRACKING
@@ -220,13 +220,13 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
         if flight.clocks.own:
             evaluate_plan(max(t + state.tau[i, OFF], p.motion.knots[0]), p, w)
             stuck = follow_own_clock(i, k, t, p, w, flight, state)
-        estimate_acceleration(i, dt, w.v[i], net, mail)
+        observe_disturbance(i, dt, w.v[i], net, mail)
         fade_silent_edges(i, k, flight.every, net, mail)
         if flight.commands.kind == OWN:
             for q in range(3):
                 w.f_u[i, q], w.f_C[i, q] = state.f_u[i, q], 0.0
         else:
-            solve_own_edges(i, k, dt, tick, p, w, net, mail, state.saturated[i])
+            solve_own_constraint_force(i, k, dt, tick, p, w, net, mail, state.saturated[i])
         if stuck:
             drop_constraint_force(i, w, net, state)
         take_desired_force(k, i, dt, p, w, flight, state)
@@ -237,7 +237,7 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
             if mail.edge[l] >= 0:
                 state.integral[mail.edge[l]] += 0.5 * mail.multiplier[l, last]
     if flight.clocks.own:
-        use_own_slots(p, w, state)
+        write_slots_by_own_clock(p, w, state)
 
 
 @jit

@@ -18,6 +18,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._common.renamed import getattr_of_earlier_names
 from rigidfleet.typing import Floats
 
 
@@ -36,7 +37,7 @@ def dcm_from_quaternion(q: ArrayLike) -> Floats:
     return _stack_matrices(rows)
 
 
-def _quaternion_products_map() -> Floats:
+def _dcm_to_quaternion_products() -> Floats:
     """4 q q^T - 1 (4, 4) of a rotation T (3, 3), which is linear in T: the map (9, 16)."""
     N = np.zeros((3, 3, 4, 4))
     for i in range(3):
@@ -51,7 +52,7 @@ def _quaternion_products_map() -> Floats:
     return N.reshape(9, 16)
 
 
-_PRODUCTS, _ONE = _quaternion_products_map(), np.eye(4)
+_PRODUCTS, _ONE = _dcm_to_quaternion_products(), np.eye(4)
 
 
 def quaternion_from_dcm(T: ArrayLike) -> Floats:
@@ -236,11 +237,11 @@ def rotation_vector_from_dcm(T: ArrayLike) -> Floats:
     """Rotation vectors (..., 3) [rad], at most pi long, of direction cosines (..., 3, 3)."""
     T = _check_vectors("T", T, 3, 3)
     if T.ndim == 2:
-        return np.array(vector_of(T))
+        return np.array(single_rotation_vector(T))
     return rotation_vector_from_quaternion(quaternion_from_dcm(T))
 
 
-def vector_of(T: Floats) -> tuple[float, float, float]:
+def single_rotation_vector(T: Floats) -> tuple[float, float, float]:
     """`rotation_vector_from_dcm` of one T (3, 3)."""
     w, x, y, z = _quaternion_of_entries(*T.ravel().tolist())
     n = math.sqrt(x * x + y * y + z * z)
@@ -260,7 +261,7 @@ def rotation_vector_rate(phi: ArrayLike, omega: ArrayLike) -> Floats:
     return np.stack(rates, axis=-1).astype(np.float64)
 
 
-def vector_rate(
+def single_rotation_vector_rate(
     x: float, y: float, z: float, p: float, q: float, r: float
 ) -> tuple[float, float, float]:
     """`rotation_vector_rate` of one phi = (x, y, z) at omega = (p, q, r)."""
@@ -276,7 +277,7 @@ def vector_rate(
     )  # fmt: skip
 
 
-_rates = np.frompyfunc(vector_rate, 6, 3)
+_rates = np.frompyfunc(single_rotation_vector_rate, 6, 3)
 
 
 def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Floats:
@@ -333,3 +334,8 @@ def _unit_quaternions(q: ArrayLike) -> Floats:
 
 def _scalar_positive(q: Floats) -> Floats:
     return np.where(q[..., :1] < 0.0, -q, q)
+
+
+__getattr__ = getattr_of_earlier_names(
+    __name__, vector_of="single_rotation_vector", vector_rate="single_rotation_vector_rate"
+)

@@ -133,14 +133,14 @@ class LoopGains:
     threshold: float = 0.1
     cutoff: float = 1e-3
 
-    def with_pole(self, p: float) -> LoopGains:
+    def with_triple_pole(self, p: float) -> LoopGains:
         """With all three poles of the constraint law at -p [1/s]."""
         alpha, beta, gamma = pid.triple_pole(p)
         return replace(self, alpha=alpha, beta=beta, gamma=gamma)
 
 
 @lru_cache
-def overshoot_time(lag: Lag, laws: LoopGains, drag: float) -> float:
+def tracking_error_gain(lag: Lag, laws: LoopGains, drag: float) -> float:
     """Time T [s] by which a vehicle that tracks leaves its reference at most, in any direction, under either law.
 
     The reference's acceleration, jerk and snap are fed forward past the attitude control, so that only rotors and the
@@ -181,14 +181,14 @@ class Loop(NamedTuple):
     channels: tuple[tuple[Lag, bool], ...]
 
     @property
-    def is_constrained(self) -> bool:
+    def has_constraint_law(self) -> bool:
         """Whether the constraint law has a share in it."""
         return bool(np.abs(self.S).max() > _NO_SHARE)
 
     def gain(self, s: Complexes, law: LoopGains) -> Complexes:
         """L (K, n, n) at s (K,)."""
         each = (..., *(None,) * self.S.ndim)
-        k_u, to_k_c, to_rigid = _gain_parts(s, law)[each]
+        k_u, to_k_c, to_rigid = _controller_terms(s, law)[each]
         K = k_u * np.eye(self.S.shape[-1]) + to_k_c * self.S + to_rigid * self.Q
         G = [lag.response(s, vertical=vertical) / (s * s) for lag, vertical in self.channels]
         if len(G) == 1:
@@ -197,7 +197,7 @@ class Loop(NamedTuple):
         return np.sum([g[each] * part for g, part in zip(G, self.P, strict=True)], axis=0) @ K
 
 
-def _gain_parts(s: Complexes, law: LoopGains) -> Complexes:
+def _controller_terms(s: Complexes, law: LoopGains) -> Complexes:
     """k_u, and what is added to it on S and on rigid motions Q (3, K): K = k_u 1 + ... S + ... Q, because S Q = 0."""
     k_c = 2 * law.alpha * s + law.beta**2 + law.gamma / s
     k_t, k_d = law.k1 + law.k2 * s + law.ki / s, law.k_def * s
@@ -414,7 +414,7 @@ def _top_frequency(loop: Loop, law: LoopGains, size: float) -> float:
     omega = np.geomspace(*_FREQUENCIES, 600)
     s = 1j * omega
     each = np.abs([lag.response(s, vertical=vertical) for lag, vertical in loop.channels])
-    k_u, to_k_c, to_rigid = np.abs(_gain_parts(s, law))
+    k_u, to_k_c, to_rigid = np.abs(_controller_terms(s, law))
     K = k_u + to_k_c + to_rigid  # the norms of S and Q are at most 1
     above = np.flatnonzero(each.max(axis=0) * K > size * omega**2)
     return float(omega[min(above[-1] + 1, len(omega) - 1)]) if len(above) else 0.0
@@ -442,7 +442,7 @@ def stability_margins(loops: Sequence[Loop], law: LoopGains, growth: float = GRO
 
 def _locus_crossings(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes, Bools]:
     """Frequencies (M,) [rad/s] where a locus is negative real or has unit gain; the loci there; which are real."""
-    omega, loci = _loci(loop, law)
+    omega, loci = _logarithms_of_loci(loop, law)
     # Numbers of log(locus) that are whole where a locus is negative real, and that change sign at unit gain.
     numbers = np.stack([(loci.imag - math.pi) / (2 * math.pi), loci.real * 1e-3])
     whole = np.floor(numbers)
@@ -467,7 +467,7 @@ def _locus_crossings(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes, Boo
     return np.exp(x[1]), np.exp(z), kind == 0
 
 
-def _loci(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes]:
+def _logarithms_of_loci(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes]:
     """Frequencies (K,) [rad/s], and the logarithms (K, n) of the loci there, each continuous."""
     end = _top_frequency(loop, law, _FAINT)
     if end <= _FREQUENCIES[0]:
@@ -505,7 +505,7 @@ def _continuous_logarithms(loci: Complexes) -> Complexes:
     return loci.real + 1j * np.unwrap(loci.imag, axis=0)
 
 
-def largest_pole(
+def largest_stable_pole(
     loops: Sequence[Loop], law: LoopGains, most: float = math.inf, growth: float = GROWTH
 ) -> float:
     """Rate p [1/s] up to which a triple pole -p of the constraint law keeps the loops stable; infinite if all do.
@@ -515,7 +515,7 @@ def largest_pole(
     """
 
     def stable(p: float) -> bool:
-        return is_stable(loops, law.with_pole(p), growth)
+        return is_stable(loops, law.with_triple_pole(p), growth)
 
     if most < math.inf and all(stable(most * part) for part in (1.0, 0.5, 0.25)):
         return most

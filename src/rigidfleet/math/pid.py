@@ -70,7 +70,7 @@ def error_response(
     t = np.asarray(t, dtype=float)
     p, A = _companion(alpha, beta, gamma)
     z0 = np.stack([p * I0, c0, cdot0 / p])
-    z = np.tensordot(exponential(A, p * t), z0, axes=1)
+    z = np.tensordot(matrix_exponential(A, p * t), z0, axes=1)
     integral, c, c_dot = np.moveaxis(z, t.ndim, 0)
     return c, p * c_dot, integral / p
 
@@ -113,7 +113,7 @@ def _companion(alpha: float, beta: float, gamma: float) -> tuple[float, Floats]:
     return p, np.array([[0, 1, 0], [0, 0, 1], [-gamma / p**3, -((beta / p) ** 2), -2 * alpha / p]])
 
 
-def exponential(A: Floats, x: Floats) -> Floats:
+def matrix_exponential(A: Floats, x: Floats) -> Floats:
     """e^(A x) (..., n, n) for A (..., n, n) and x (...): a Taylor series for |A x| <= 1/2, then repeated doubling.
 
     For many small matrices, much faster than `scipy.linalg.expm`, which takes long to load, too. The doubling uses
@@ -150,7 +150,7 @@ def _time_grid(alpha: float, beta: float, gamma: float, tolerance: float) -> Flo
     X = np.linalg.solve(np.kron(A.T, one) + np.kron(one, A.T), -one.ravel()).reshape(A.shape)
     bound = np.linalg.inv(X)[1 - first, 1 - first]
     x = 1.0
-    while bound * (z := exponential(A, np.array(x)) @ z0) @ X @ z > tolerance**2:
+    while bound * (z := matrix_exponential(A, np.array(x)) @ z0) @ X @ z > tolerance**2:
         x *= 2.0
     s = poles(alpha, beta, gamma)
     swings = np.abs(s.imag).max() * x / p / math.pi

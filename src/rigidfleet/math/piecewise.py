@@ -168,7 +168,7 @@ def hermite_pieces(h: Floats, begin: Floats, end: Floats) -> Floats:
     scale = np.stack([h**k for k in range(2 * m)])
     start = series.from_derivatives(begin) * scale[:m]  # coefficients in u = (t - t0) / h
     reached = [sum(start[k] * float(perm(k, j)) for k in range(j, m)) for j in range(m)]
-    rest = np.tensordot(_matrix_to_highest(m), end * scale[:m] - np.stack(reached), 1)
+    rest = np.tensordot(_hermite_end_matrix(m), end * scale[:m] - np.stack(reached), 1)
     return np.moveaxis(np.concatenate([start, rest]) / scale, 0, -1)
 
 
@@ -246,7 +246,7 @@ def _piece_widths(time: Floats, pieces: Floats) -> Floats:
 
 
 @cache
-def _matrix_to_highest(m: int) -> Floats:
+def _hermite_end_matrix(m: int) -> Floats:
     """From the m derivatives that lack at the end of a piece of unit length to its m highest coefficients.
 
     It is the inverse of the rows k! / (k - j)! of u^k at u = 1, whose entries are whole sixths for m up to 4.

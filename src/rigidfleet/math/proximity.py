@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._common.renamed import getattr_of_earlier_names
 from rigidfleet.solids import distance
 from rigidfleet.solids.records import HEIGHTS, HULL, Solids
 from rigidfleet.typing import Bools, Floats, Ints
@@ -53,14 +54,14 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
     radius = np.asarray(radius, dtype=float)
     left: Bools = np.logical_and.reduce(np.isfinite(r), axis=2)
     if not left.all():  # agents without a position do not affect the others
-        return separation_of_left(r, radius, left)
+        return separation_of_remaining(r, radius, left)
     if r.shape[1] > _MANY:
         return _closest_of_many(r, radius)
 
-    def apart(d: Floats, radii: Floats) -> Floats:
+    def surface_distance(d: Floats, radii: Floats) -> Floats:
         return root_of_squares(d) - radii
 
-    return _least_of_pairs(r, radius, apart)
+    return _least_of_pairs(r, radius, surface_distance)
 
 
 def _least_of_pairs(
@@ -94,7 +95,7 @@ def all_pairs(n: int) -> Ints:
     return np.stack(np.triu_indices(n, 1))
 
 
-def lengths(r: Floats, pairs: Ints) -> Floats:
+def pair_distances(r: Floats, pairs: Ints) -> Floats:
     """Distances (m, K) [m] of pairs (m, 2) of agents r (K, N, 3): a row for each pair, which is faster."""
     x, apart = np.ascontiguousarray(r.T), np.empty((len(pairs), len(r)))
     some = max(1, CACHED // (3 * len(r)))
@@ -118,8 +119,8 @@ def _closest_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
     """`separation` of many agents r (K, N, 3), all finite, in O(N) or O(N log N) per sample.
 
     A tree finds the near pairs at one sample. They are used for later samples as long as no other pair can have come
-    as near: apart from rigid motion of the whole, agents that have moved by at most some way (`_greatest_move`) have
-    changed no distance by more than twice that.
+    as near: apart from rigid motion of the whole, agents that have moved by at most some way
+    (`_greatest_deformation`) have changed no distance by more than twice that.
     """
     least, pair = np.empty(len(r)), np.empty((len(r), 2), dtype=np.int64)
     near, rest = None, np.zeros((3, 0))
@@ -130,7 +131,7 @@ def _closest_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
         if near is not None:
             apart = near.separations(p)
             at = int(apart.argmin())
-        if near is None or apart[at] > near.beyond - 2.0 * _greatest_move(rest, p):
+        if near is None or apart[at] > near.beyond - 2.0 * _greatest_deformation(rest, p):
             near, rest = _pairs_near_least(p, radius), p
             apart = near.separations(p)
             at = int(apart.argmin())
@@ -171,7 +172,7 @@ def _pairs_near_least(p: Floats, radius: Floats) -> _Near:
     return _Near(np.ascontiguousarray(pairs[:, near]), candidates.radii[near], beyond)
 
 
-def _greatest_move(before: Floats, after: Floats) -> float:
+def _greatest_deformation(before: Floats, after: Floats) -> float:
     """Greatest displacement [m] of an agent, from (3, N) to (3, N), after removing the rigid motion of all."""
     U, _, Vt = np.linalg.svd(after @ before.T)
     moved = after - (U @ Vt) @ before  # a reflection also preserves distances
@@ -235,7 +236,7 @@ def least_clearance(clearance: Floats, nearest: Ints) -> tuple[Floats, Ints, Int
     return rows.min(axis=0), np.where(obstacle < 0, -1, agent), obstacle
 
 
-def separation_of_left(r: Floats, radius: ArrayLike, left: Bools) -> tuple[Floats, Ints]:
+def separation_of_remaining(r: Floats, radius: ArrayLike, left: Bools) -> tuple[Floats, Ints]:
     """`separation` among the agents ``left`` (K, N) at each sample."""
     radius = np.asarray(radius, dtype=float)
     if left.all():
@@ -268,7 +269,7 @@ def closeness(
     if not left.all():
         each[~left] = np.inf
     return Closeness(
-        *separation_of_left(r, radius, left), each, nearest, *least_clearance(each, nearest)
+        *separation_of_remaining(r, radius, left), each, nearest, *least_clearance(each, nearest)
     )
 
 
@@ -376,3 +377,8 @@ def nearest(points: ArrayLike) -> Floats:
     from scipy.spatial import KDTree
 
     return KDTree(p).query(p, k=2)[0][:, 1]
+
+
+__getattr__ = getattr_of_earlier_names(
+    __name__, separation_of_left="separation_of_remaining", lengths="pair_distances"
+)

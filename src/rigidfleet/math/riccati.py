@@ -52,7 +52,7 @@ def costs_and_states(
 
 
 def _costs_by_doubling(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
-    """P (..., n, n) at times to go tau (...), from the flow of `_propagate`."""
+    """P (..., n, n) at times to go tau (...), from the flow of `_transition_and_gramians`."""
     X, Phi, W, V = _hamiltonian_flow(A, G, Q, S, tau, tau.max(initial=0.0))
     D = S - X
     P = X + V + _transpose(Phi) @ solve_linear(np.eye(len(A)) + D @ W, D @ Phi)
@@ -72,7 +72,7 @@ def _needs_small_steps(A: Floats, G: Floats, Q: Floats, S: Floats, T: float) -> 
     stages = np.ldexp(T, -np.arange(math.ceil(math.log2(2.0 * rate * T)) + 1))
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            Phi = _propagate(A, G, Q, stages, rate)[0]
+            Phi = _transition_and_gramians(A, G, Q, stages, rate)[0]
     except np.linalg.LinAlgError:  # too great for any digits
         return True
     return not float(np.abs(Phi).max()) <= _GROWTH  # true for NaN
@@ -90,7 +90,7 @@ def _march_costs(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tup
     every, which = np.unique(tau, return_inverse=True)
     for span in np.diff(every, prepend=0.0):
         left = max(1, math.ceil(span * rate / math.log(_GROWTH)))
-        Phi, W, V, _ = _propagate(A, G, Q, np.array(span / left), rate)
+        Phi, W, V, _ = _transition_and_gramians(A, G, Q, np.array(span / left), rate)
         move = identity
         while left:
             value, vector = np.linalg.eigh(P)
@@ -119,19 +119,19 @@ def _march_costs(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tup
 def _hamiltonian_flow(
     A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats, T: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """X (n, n) and Phi, W, V (..., n, n) over tau (...), as `_propagate` has them of P - X.
+    """X (n, n) and Phi, W, V (..., n, n) over tau (...), as `_transition_and_gramians` has them of P - X.
 
     Raises ValueError if P, starting from S, does not exist at all times to go up to T.
     """
     if is_semidefinite(Q) and is_semidefinite(S):
-        return np.zeros_like(Q), *_propagate(A, G, Q, tau, _fastest_rate(A, G, Q))[:3]
+        return np.zeros_like(Q), *_transition_and_gramians(A, G, Q, tau, _fastest_rate(A, G, Q))[:3]
     # P - S starts from zero. Its Phi, W and V therefore exist exactly as long as P does.
     GS = G @ S
     A, Q = A - GS, A.T @ S + S @ A - S @ GS + Q
     rate = float(np.linalg.norm(A, 2) + np.sqrt(np.linalg.norm(G, 2) * np.linalg.norm(Q, 2)))
 
     def escapes(t: float) -> bool:
-        return bool(_propagate(A, G, Q, np.array(t), rate)[3])
+        return bool(_transition_and_gramians(A, G, Q, np.array(t), rate)[3])
 
     if escapes(T):
         low, high = 0.0, T
@@ -143,7 +143,7 @@ def _hamiltonian_flow(
             f" beyond all bounds at a time to go of {high:.10g} s. Shorten the horizon, or make Q or S"
             " greater or N less, so that the cost cannot fall below all bounds"
         )
-    return S, *_propagate(A, G, Q, tau, rate)[:3]
+    return S, *_transition_and_gramians(A, G, Q, tau, rate)[:3]
 
 
 def solution_by_subspace(H: Floats) -> Floats:
@@ -177,7 +177,7 @@ def _fastest_rate(A: Floats, G: Floats, Q: Floats) -> float:
     return float(np.abs(np.linalg.eigvals(hamiltonian(A, G, Q))).max())
 
 
-def _propagate(
+def _transition_and_gramians(
     A: Floats, G: Floats, Q: Floats, tau: Floats, rate: float
 ) -> tuple[Floats, Floats, Floats, Bools]:
     """Phi, W, V (..., n, n): x(tau) = Phi x(0) - W y(tau), y(0) = V x(0) + Phi^T y(tau).

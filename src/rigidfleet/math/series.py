@@ -25,15 +25,15 @@ _FACTORIALS = np.array([float(math.factorial(k)) for k in range(64)])
 
 def derivatives(x: Floats) -> Floats:
     """Derivatives 0 to n (n + 1, ...) of a series; factorials are multiplied in."""
-    return x * _factorials(x)
+    return x * _factorials_per_order(x)
 
 
 def from_derivatives(x: Floats) -> Floats:
     """The series of which `derivatives` are ``x`` (n + 1, ...)."""
-    return x / _factorials(x)
+    return x / _factorials_per_order(x)
 
 
-def _factorials(x: Floats) -> Floats:
+def _factorials_per_order(x: Floats) -> Floats:
     return _FACTORIALS[: len(x)].reshape(-1, *(1,) * (x.ndim - 1))
 
 

@@ -73,7 +73,7 @@ def reaction_times(models: Sequence[VehicleModel], disturbances: Disturbances | 
     return delay + np.array(own)
 
 
-def reaction_lags(
+def lag_coefficients(
     models: Sequence[VehicleModel], disturbances: Disturbances | None, gravity: float
 ) -> Floats:
     """Lags (N, 3, 3) of `AvoidanceArrays.ahead`; 0 of points.

@@ -24,7 +24,7 @@ def split_shared_formations(
     for phase in phases:
         shaping = phase.shaping
         if shaping is None:
-            if phase.vertical is not None and phase.vertical.each:
+            if phase.vertical is not None and phase.vertical.has_way_per_vehicle:
                 before = None
                 ways = {way for way in ways if way[0] is not None}
             renamed.append(phase)

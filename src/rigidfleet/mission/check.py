@@ -64,7 +64,7 @@ def check_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     """
     m = Draft(data, origin, default_tables())
     m.n = _count_agents(data)
-    m.record_breaches((), _size_rules(m))
+    m.record_breaches((), _count_bound_rules(m))
     if m.findings:  # the other checks would take long
         raise MissionError(m.findings)
     _validate_tables(m)
@@ -84,7 +84,7 @@ def check_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
         (("disturbances",), disturbances.disturbance_rules),
         (("network",), network.network_rules),
         ((), losses.loss_rules),
-        (("disturbances",), disturbances.disturbance_size_rules),
+        (("disturbances",), disturbances.disturbance_memory_rules),
         ((), vehicles.vehicle_flight_rules),
         (("agents", "fixed"), _fixed_agent_rules),
         ((), avoidance.avoidance_rules),
@@ -95,7 +95,7 @@ def check_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     return m.parts
 
 
-def _size_rules(m: Draft) -> Breaches:
+def _count_bound_rules(m: Draft) -> Breaches:
     """Counts beyond the bounds, before anything else is checked."""
     agents, forms = m.data.get("agents"), m.data.get("formations")
     lists: list[tuple[Keys, int, str]] = [
@@ -188,7 +188,7 @@ def _agent_rules(m: Draft) -> Breaches:
     if agents is None:
         return
     for key in ("mass", "velocity", "radius", "thrust_limit"):
-        yield from m.one_per_agent(agents, key)
+        yield from m.one_per_agent_rules(agents, key)
     # Without a formation, nothing divides by distances: the start may be one that others flew.
     shaped = look_up(m.data, ("formations",))
     for i, j in formations.coincident_pairs(agents.position) if shaped else ():

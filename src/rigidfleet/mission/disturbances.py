@@ -48,7 +48,7 @@ def disturbance_rules(m: Draft) -> Breaches:
     if d is None:
         return
     for key in ("drag", "mass_error"):
-        yield from m.one_per_agent(d, key, alone=", or a single number")
+        yield from m.one_per_agent_rules(d, key, alone=", or a single number")
     drag = d.drag if isinstance(d.drag, tuple) else (d.drag,)
     if (any(d.wind) or d.gusts is not None) and not any(c is None or c > 0 for c in drag):
         problem = "without drag, wind and gusts have no effect"
@@ -102,7 +102,7 @@ def _gust_rules(m: Draft, gusts: Gusts, wind: bool) -> Breaches:
         yield Breach("correlation_length", problem, remedy)
 
 
-def disturbance_size_rules(m: Draft) -> Breaches:
+def disturbance_memory_rules(m: Draft) -> Breaches:
     """Tables of gusts and noise fit into memory."""
     d: Disturbances | None = m.disturbances
     if d is None or m.end is None or m.n is None or m.findings:

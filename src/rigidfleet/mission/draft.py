@@ -72,7 +72,7 @@ def draft(
     """
     if shape is None:
         shape = shape_for(agents)
-    shape_known(shape)
+    check_shape_name(shape)
     n = agents_for(shape) if agents is None else agents
     if n > MOST_AGENTS:
         raise ValueError(f"{n} agents are too many: a new mission has at most {MOST_AGENTS}")
@@ -117,7 +117,7 @@ def draft(
     return align_comments(text)
 
 
-def shape_known(shape: str) -> None:
+def check_shape_name(shape: str) -> None:
     """Raise ValueError, with the most similar name, if there is no such shape."""
     if shape not in shapes.SHAPES:
         raise ValueError(f"there is no shape {shape!r}: {suggest_shape(shape)}")
@@ -185,7 +185,9 @@ def align_comments(text: str) -> str:
     return beside.sub(lambda m: f"{m[1]:<{_COLUMN - 1}} # {m[2]}", text)
 
 
-__getattr__ = getattr_of_earlier_names(__name__, aligned="align_comments")
+__getattr__ = getattr_of_earlier_names(
+    __name__, shape_known="check_shape_name", aligned="align_comments"
+)
 
 
 def _toml_row(values: Sequence[float] | Floats) -> str:

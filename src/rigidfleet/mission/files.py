@@ -20,7 +20,7 @@ import numpy as np
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, TrajectoryError
 from rigidfleet.mission import bounds
-from rigidfleet.mission.text import read_error
+from rigidfleet.mission.text import text_error
 
 #: What stands before the digest of a file.
 _DIGEST = "SHA-256 "
@@ -52,7 +52,7 @@ class Content(NamedTuple):
     notes: Sequence[str] = ()
 
 
-def fill_in_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, Any], str]:
+def inline_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, Any], str]:
     """A mission in which numbers stand instead of the names of files, with the SHA-256 digest of each in its text.
 
     That text is written anew, without comments.
@@ -199,7 +199,7 @@ def _read_trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) 
         raise _file_error(name, "", error) from None
     for doubt in read.notes:
         if isinstance(doubt, Doubt):
-            raise read_error(
+            raise text_error(
                 name, doubt, "say units or axes beside the file: units = 'ms', axes = 'ned'"
             )
     curves, notes = [*read.curves], [*read.notes]
@@ -213,7 +213,7 @@ def _read_trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) 
         curves = [c.refine(np.union1d(begin, c.time), stays=True) for c in curves]
     if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
         why = next((note for note in read.notes if "yaw" in note), "has no yaw")
-        raise read_error(name, why, "remove yaw = 'file', or give a file with a yaw and its unit")
+        raise text_error(name, why, "remove yaw = 'file', or give a file with a yaw and its unit")
     rows = [curve_to_rows(c._replace(pieces=np.nan_to_num(c.pieces))) for c in curves]
     return Content(rows, notes=notes)
 
@@ -224,7 +224,7 @@ _NOWHERE, _MARK = 9000.0, -999.0
 FILL = "fill the cells, for example from their neighbours, or cut the map"
 
 
-def missing_cells(heights: Any) -> str:
+def missing_cells_text(heights: Any) -> str:
     """Where heights (I, J) [m] have cells without data, as elevation models mark them (NaN, -9999, -32768, ...)."""
     z = np.asarray(heights, dtype=float)
     cells = np.argwhere(~(np.abs(z) < _NOWHERE) | (z == _MARK))
@@ -252,13 +252,13 @@ def _read_heights(data: bytes, name: str) -> Content:
         heights = np.asarray(heights, dtype=float)
     except (ValueError, EOFError, OSError):
         remedy = "give rows of equal length, separated by commas, or an NPY array"
-        raise read_error(name, "is not a table of numbers", remedy) from None
+        raise text_error(name, "is not a table of numbers", remedy) from None
     if heights.ndim != 2 or not heights.size:
         remedy = "give two or more rows of heights [m]"
-        raise read_error(name, "is not a table of numbers", remedy)
-    if why := missing_cells(heights):
-        raise read_error(name, why, FILL)
+        raise text_error(name, "is not a table of numbers", remedy)
+    if why := missing_cells_text(heights):
+        raise text_error(name, why, FILL)
     if heights.size > bounds.HEIGHTS:
         problem = f"has {heights.size:,} heights; the maximum is {bounds.HEIGHTS:,}"
-        raise read_error(name, problem, "use a coarser grid")
+        raise text_error(name, problem, "use a coarser grid")
     return Content(heights.tolist())

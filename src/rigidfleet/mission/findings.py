@@ -63,7 +63,7 @@ class FindingCollector:
         key = _key_path(path)
         if (key, problem) in self._findings:
             return
-        kind = _counting_key(path, problem)
+        kind = _finding_count_key(path, problem)
         if problem == _UNKNOWN or _ANY in kind:
             self._counts[kind] += 1
             if self._counts[kind] > _MOST_OF_A_KIND:
@@ -73,8 +73,8 @@ class FindingCollector:
 
     def add_unknown_key(self, path: Keys, known: Iterable[str]) -> None:
         """Record an unknown key of a table. Only the first ones get a suggestion, as finding one takes long."""
-        guess = self._counts[_counting_key(path, _UNKNOWN)] < _MOST_OF_A_KIND
-        self.add(path, *(unknown_key(path[-1], known) if guess else (_UNKNOWN, "")))
+        guess = self._counts[_finding_count_key(path, _UNKNOWN)] < _MOST_OF_A_KIND
+        self.add(path, *(unknown_key_in_words(path[-1], known) if guess else (_UNKNOWN, "")))
 
     def is_valid(self, path: Keys, *keys: str) -> bool:
         """Whether there is no finding so far at or below these keys of a table."""
@@ -181,7 +181,7 @@ def suggest_shape(word: object) -> str:
     return match or f"known shapes: {', '.join(SHAPES)}"
 
 
-def unknown_key(key: object, known: Iterable[str]) -> tuple[str, str]:
+def unknown_key_in_words(key: object, known: Iterable[str]) -> tuple[str, str]:
     """Problem and remedy of an unknown key."""
     names = list(known)
     suggestion = rename_hint(key) or suggest(key, names)
@@ -197,7 +197,7 @@ def _key_path(path: Keys) -> str:
     return "".join(map(step, path)).removeprefix(".")
 
 
-def _counting_key(path: Keys, problem: str) -> Keys:
+def _finding_count_key(path: Keys, problem: str) -> Keys:
     """Key by which findings are counted: their path with any index, and one key for all unknown keys of a table."""
     path = path[:-1] if problem == _UNKNOWN else path
     return tuple(_ANY if isinstance(step, int) else step for step in path)

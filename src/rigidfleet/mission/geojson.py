@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
-from rigidfleet.mission.text import read_error
+from rigidfleet.mission.text import text_error
 
 #: Names of the one system of coordinates that GeoJSON has, as older files write it.
 _WGS84 = "CRS84", "EPSG::4326", "EPSG:4326"
@@ -25,17 +25,17 @@ def read_geojson(data: bytes, name: str) -> tuple[list[list[list[list[float]]]],
         root = json.loads(data.decode("utf-8-sig"))
         crs = (root.get("crs") or {}).get("properties", {}).get("name", _WGS84[0])
     except (ValueError, AttributeError, RecursionError):
-        raise read_error(name, "is no GeoJSON", "give a file with a polygon") from None
+        raise text_error(name, "is no GeoJSON", "give a file with a polygon") from None
     if not str(crs).endswith(_WGS84):
         remedy = "convert it to longitude and latitude (WGS 84), as GeoJSON asks"
-        raise read_error(name, f"has the coordinate reference system {crs!r}", remedy)
+        raise text_error(name, f"has the coordinate reference system {crs!r}", remedy)
     try:
         polygons = [[_ring(ring, notes) for ring in rings] for rings in _polygons(root, notes)]
     except (ValueError, TypeError, AttributeError, LookupError, RecursionError):
         remedy = "give polygons as lists of rings of [longitude, latitude], in degrees"
-        raise read_error(name, "has coordinates that are no polygons", remedy) from None
+        raise text_error(name, "has coordinates that are no polygons", remedy) from None
     if not all(polygons) or not polygons:
-        raise read_error(name, "has no polygon", "give a file with a Polygon or a MultiPolygon")
+        raise text_error(name, "has no polygon", "give a file with a Polygon or a MultiPolygon")
     return polygons, list(dict.fromkeys(notes))
 
 

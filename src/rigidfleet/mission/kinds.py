@@ -31,7 +31,17 @@ class Settle(Part):
     timeout: values.Time = key("time after which the mission fails [s]", 60.0)
 
 
-@with_earlier_names(led="follows_curves", spelled="flown_as_written", ended="keys_if_ended")
+@with_earlier_names(
+    led="follows_curves",
+    spelled="flown_as_written",
+    ended="keys_if_ended",
+    automatic="auto_keys",
+    angles="angles_in_words",
+    free="has_free_velocity",
+    place="rest_position",
+    meets="commanded_at_arrival",
+    bent="has_bent_ways",
+)
 class AnyPhase(Part):
     """Keys of every phase. Exactly one of until, duration and settle ends it."""
 
@@ -91,22 +101,22 @@ class AnyPhase(Part):
         return None
 
     @property
-    def angles(self) -> list[str]:
+    def angles_in_words(self) -> list[str]:
         """Commanded angles in words; empty to keep the attitude commanded before."""
         angles = zip(("roll", "pitch", "yaw"), self.attitude_deg or (), strict=False)
         return [f"{name} {angle:g}°" for name, angle in angles if angle or name == "yaw"]
 
     @property
-    def meets(self) -> tuple[str, ...]:
+    def commanded_at_arrival(self) -> tuple[str, ...]:
         """Which of position, velocity, attitude and rates are commanded at the arrival."""
         if not self.goal_moves:
             return ()
         return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
 
     @property
-    def free(self) -> bool:
+    def has_free_velocity(self) -> bool:
         """Whether a place is to be reached at any velocity."""
-        meets = self.meets
+        meets = self.commanded_at_arrival
         return "position" in meets and "velocity" not in meets
 
     @property
@@ -115,7 +125,7 @@ class AnyPhase(Part):
         return False
 
     @property
-    def place(self) -> values.Vector | None:
+    def rest_position(self) -> values.Vector | None:
         """Centre of mass to rest at [m], of a phase that comes to rest; None for where it is."""
         return None
 
@@ -135,12 +145,12 @@ class AnyPhase(Part):
         return True
 
     @property
-    def bent(self) -> bool:
+    def has_bent_ways(self) -> bool:
         """Whether the phase leads its vehicles on bent ways to a formation."""
         return False
 
     @property
-    def automatic(self) -> list[str]:
+    def auto_keys(self) -> list[str]:
         """Keys whose times follow from the limits (`rigidfleet.planning.timing`)."""
         return [key for key in TIMES if self.__dict__.get(key) == AUTO]
 
@@ -222,12 +232,12 @@ class Shaping(AnyPhase):
     )
 
     @property
-    def meets(self) -> tuple[str, ...]:
+    def commanded_at_arrival(self) -> tuple[str, ...]:
         """Position and velocity, if a place is commanded."""
         return () if self.position is None else ("position", "velocity")
 
     @property
-    def place(self) -> values.Vector | None:
+    def rest_position(self) -> values.Vector | None:
         """The position, if it is commanded."""
         return self.position
 
@@ -240,7 +250,7 @@ class Shaping(AnyPhase):
     def leads_to(self) -> str:
         """The formation, and its place and angles if they are commanded."""
         place = [] if self.position is None else [_vector(self.position, "m")]
-        return ", ".join([self.formation, *place, *self.angles])
+        return ", ".join([self.formation, *place, *self.angles_in_words])
 
     def keys_if_ended(self, length: float) -> dict[str, Any]:
         """The formation, and a blend that is not longer than the phase; a step has none."""
@@ -289,7 +299,7 @@ class Reshape(Shaping):
         return self.transition == "straight"
 
     @property
-    def bent(self) -> bool:
+    def has_bent_ways(self) -> bool:
         """Whether ways have been found, or given."""
         return self.control_points is not None
 
@@ -306,7 +316,7 @@ class Steering(Attitude, AnyPhase):
     rates_deg_s: values.Rates = key("body rates [p, q, r] at arrival [deg/s]", (0.0, 0.0, 0.0))
 
     @property
-    def meets(self) -> tuple[str, ...]:
+    def commanded_at_arrival(self) -> tuple[str, ...]:
         """The attitude, if one is commanded."""
         return () if self.attitude_deg is None else ("attitude", "rates")
 
@@ -314,7 +324,7 @@ class Steering(Attitude, AnyPhase):
     def leads_to(self) -> str:
         """The commanded angles and rates."""
         rates = [_vector(self.rates_deg_s, "°/s")] if any(self.rates_deg_s) else []
-        return ", ".join([*self.angles, *rates])
+        return ", ".join([*self.angles_in_words, *rates])
 
 
 class Through(Part):
@@ -349,10 +359,10 @@ class Fly(Steering):
         return self.through
 
     @property
-    def meets(self) -> tuple[str, ...]:
+    def commanded_at_arrival(self) -> tuple[str, ...]:
         """Position and velocity (unless it is free), and the attitude if one is commanded."""
         velocity = () if self.velocity == "free" else ("velocity",)
-        return ("position", *velocity, *super().meets)
+        return ("position", *velocity, *super().commanded_at_arrival)
 
     @property
     def leads_to(self) -> str:
@@ -386,7 +396,7 @@ class Go(Attitude, AnyPhase):
     @property
     def leads_to(self) -> str:
         """The position and the attitude."""
-        return ", ".join([_vector(self.position, "m"), *self.angles])
+        return ", ".join([_vector(self.position, "m"), *self.angles_in_words])
 
 
 class Turn(Steering):
@@ -418,6 +428,7 @@ class Brake(Arriving):
     kind: Literal["brake"] = required_key("come to rest where braking leads")
 
 
+@with_earlier_names(meets="commanded_at_arrival", each="has_way_per_vehicle")
 class Vertical(Arriving):
     """A phase that leads vehicles straight up or down: all together, some of them, or one group after another."""
 
@@ -446,17 +457,17 @@ class Vertical(Arriving):
         return self.stagger is None and self.__dict__.get("places") != "own"
 
     @property
-    def level(self) -> float | None:
+    def arrival_height(self) -> float | None:
         """Height of all vehicles above the ground on arrival [m]; None to come down to it."""
         return None
 
     @property
-    def each(self) -> bool:
+    def has_way_per_vehicle(self) -> bool:
         """Whether each vehicle has a way of its own, so that the shape may change."""
         return bool(self.agents) or self.stagger is not None
 
     @property
-    def meets(self) -> tuple[str, ...]:
+    def commanded_at_arrival(self) -> tuple[str, ...]:
         """Position and velocity on arrival."""
         return ("position", "velocity")
 
@@ -470,12 +481,12 @@ class Takeoff(Vertical):
     )
 
     @property
-    def level(self) -> float | None:
+    def arrival_height(self) -> float | None:
         """The height."""
         return self.height
 
     @property
-    def each(self) -> bool:
+    def has_way_per_vehicle(self) -> bool:
         """Always: vehicles that stand on different heights come level."""
         return True
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rigidfleet.errors import wrong_type
-from rigidfleet.mission.files import fill_in_files
+from rigidfleet.mission.files import inline_files
 from rigidfleet.mission.model import Mission
 from rigidfleet.mission.schema import Start
 from rigidfleet.mission.text import mission_names, mission_text, parse_toml, read_text
@@ -35,7 +35,7 @@ def mission_of_file(text: str, origin: str) -> Mission:
     MissionError
         The text is no mission, or a file cannot be read.
     """
-    data, text = fill_in_files(parse_toml(text, origin), text, Path(origin))
+    data, text = inline_files(parse_toml(text, origin), text, Path(origin))
     return Mission.from_plain(data, origin, text=text)
 
 

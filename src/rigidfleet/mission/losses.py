@@ -157,7 +157,7 @@ def _landing_rules(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
             yield Breach(where, "there is no such formation", remedy)
             return
         slots = forms[name].slot_array(n) if has_no_findings(m, name) else None
-        words = "it has no slots to track" if slots is None else _uneven_text(slots, radius)
+        words = "it has no slots to track" if slots is None else _uneven_landing_text(slots, radius)
         if words:
             remedy = "name a level formation, such as a line or a square"
             yield Breach(where, f"cannot land: {words}", remedy)
@@ -170,14 +170,14 @@ def _landing_rules(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
         points = np.array(m.agents.position) if one is None else forms[one].slot_array(n)
         if points is None:
             continue  # distances alone cannot be tracked, which is another finding
-        if words := _uneven_text(points, radius):
+        if words := _uneven_landing_text(points, radius):
             what = "the start" if one is None else f"'{one}'"
             problem = f"{what} cannot land as it is: {words}"
             remedy = "give landing_formation, a level formation that is taken before the descent"
             yield Breach((_TABLE, "on_loss"), problem, remedy)
 
 
-def _uneven_text(points: Floats, radius: Sequence[float]) -> str:
+def _uneven_landing_text(points: Floats, radius: Sequence[float]) -> str:
     """Why vehicles at these places (N, 3) do not reach the ground together; "" if they do."""
     points, size = np.asarray(points), np.array(radius)
     bottom = points[:, 2] - size

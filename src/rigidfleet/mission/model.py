@@ -28,9 +28,9 @@ from rigidfleet.mission.check import check_parts, default_tables
 from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
-from rigidfleet.mission.phases import end_of_phases
+from rigidfleet.mission.phases import latest_end_of_phases
 from rigidfleet.mission.schema import DRAG, Aborting, Contents
-from rigidfleet.mission.text import parse_toml, read_error
+from rigidfleet.mission.text import parse_toml, text_error
 from rigidfleet.mission.vehicles import VehicleModel, model_of_vehicle
 from rigidfleet.solids.distance import height_below
 from rigidfleet.solids.records import Solids, join_solids
@@ -86,7 +86,7 @@ _STANDING = 0.5
 _LISTED = 60
 
 
-@with_earlier_names(linked="has_link")
+@with_earlier_names(linked="has_link", free_attitude="leaves_attitude_free")
 class Mission(Contents, Shown):
     """A checked mission. Create one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`.
 
@@ -160,9 +160,9 @@ class Mission(Contents, Shown):
         try:
             copied = to_toml_data(data)
         except TypeError as error:
-            raise read_error(origin, str(error), "use numbers, strings, lists and dicts") from None
+            raise text_error(origin, str(error), "use numbers, strings, lists and dicts") from None
         except RecursionError:
-            raise read_error(origin, "is nested too deeply", "use the keys of a mission") from None
+            raise text_error(origin, "is nested too deeply", "use the keys of a mission") from None
         return cls.from_plain(copied, origin)
 
     def rewritten(self, data: Mapping[str, Any], origin: str | None = None) -> Self:
@@ -174,7 +174,7 @@ class Mission(Contents, Shown):
             With a finding for each error.
         """
         mission = self.from_dict(data, self._origin if origin is None else origin)
-        mission._about = self.about
+        mission._about = self.file_digests_text
         return mission
 
     def with_phases(self, phases: list[dict[str, Any]]) -> Self:
@@ -247,7 +247,7 @@ class Mission(Contents, Shown):
         return sha256(self.text.encode()).hexdigest()
 
     @property
-    def about(self) -> str:
+    def file_digests_text(self) -> str:
         """What its text tells of the files that were read: lines with their digests."""
         return self._about or digest_lines(self._text)
 
@@ -313,7 +313,7 @@ class Mission(Contents, Shown):
                 lies = commanded = dcm_from_euler(np.deg2rad(angles))
             if p.turns_away:
                 lies = commanded = None
-            if (vertical := p.vertical) is not None and vertical.each:
+            if (vertical := p.vertical) is not None and vertical.has_way_per_vehicle:
                 before, up = None, np.eye(3)[2] if lies is None else lies[:, 2]
                 who, places = vertical.movers(self.n_agents), places.copy()
                 places[who] -= np.outer(places[who] @ up, up)  # all on one level
@@ -322,7 +322,7 @@ class Mission(Contents, Shown):
             name = shaping.formation
             up = np.eye(3)[2] if lies is None else lies[:, 2]
             axes: Floats | None = np.eye(3)  # axes of this formation in those of the one before
-            if self.free_attitude(p):
+            if self.leaves_attitude_free(p):
                 axes = lies = None
                 commanded = None if p.control == "tracking" else commanded
             elif (establishing := p.establishing) is not None:
@@ -370,7 +370,7 @@ class Mission(Contents, Shown):
             return dcm_from_euler(np.deg2rad(angles))
         return self.drawn_attitude if commanded is None else commanded
 
-    def free_attitude(self, phase: Phase) -> bool:
+    def leaves_attitude_free(self, phase: Phase) -> bool:
         """Whether a phase leaves the attitude of its formation free.
 
         Constraint forces do not control the attitude. Tracked slots do, unless the phase has ``attitude = "free"`` or
@@ -462,7 +462,7 @@ class Mission(Contents, Shown):
 
         It is nan while a duration before it is automatic (`rigidfleet.planning.timing.complete_times`).
         """
-        return end_of_phases(self.phases)
+        return latest_end_of_phases(self.phases)
 
     @cached_property
     def fleet(self) -> Fleet:
@@ -499,14 +499,14 @@ class Mission(Contents, Shown):
         x, y, z = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in (x, y, z)))
         return np.maximum(height_below(x, y, z, self.roofs), self.ground)
 
-    def standing(self, r: Floats) -> Bools:
+    def is_standing(self, r: Floats) -> Bools:
         """Which vehicles at r (N, 3) [m] stand on what is below them, (N,)."""
         return r[:, 2] - self.fleet.radius - self.height_at(*r.T) <= _STANDING
 
-    def landings_in_words(self, end: Floats) -> str:
+    def landing_swaps_in_words(self, end: Floats) -> str:
         """Which vehicles land where which other one stood, of those at ``end`` (N, 3) [m]; "" if none does."""
-        start, stand = self.fleet.position, self.standing(end)
-        if len(end) < 2 or not stand.any() or not (self.standing(start) & stand).any():
+        start, stand = self.fleet.position, self.is_standing(end)
+        if len(end) < 2 or not stand.any() or not (self.is_standing(start) & stand).any():
             return ""
         from scipy.spatial import KDTree
 

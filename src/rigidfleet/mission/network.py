@@ -17,11 +17,11 @@ def network_rules(m: Draft) -> Breaches:
         yield Breach((), *NOT_SAMPLED, None)
     if net.burst is not None and not net.loss:
         yield Breach("burst", "has no effect without loss", "add loss, or remove it")
-    if net.budget is not None and m.n is not None and net.sent_rate(m.n) < 1.0:
+    if net.budget is not None and m.n is not None and net.broadcast_rate(m.n) < 1.0:
         problem = f"leaves each of {m.n:,} vehicles less than one broadcast a second"
         yield Breach("budget", problem, f"give at least {m.n} Hz, or remove it")
     for key in ("late", "drift") if net.clocks else ():
-        yield from m.one_per_agent(net.clocks, key, "clocks", alone=", or a single number")
+        yield from m.one_per_agent_rules(net.clocks, key, "clocks", alone=", or a single number")
     for k, one in enumerate(net.outages):
         yield from agent_rules(m, ("outages", k, "between"), one.between)
         if one.end <= one.start:

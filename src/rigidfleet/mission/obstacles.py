@@ -11,7 +11,7 @@ from pydantic import Field
 
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds, values
-from rigidfleet.mission.files import FILL, NOT_A_FILE, missing_cells
+from rigidfleet.mission.files import FILL, NOT_A_FILE, missing_cells_text
 from rigidfleet.mission.findings import FindingCollector, Keys
 from rigidfleet.mission.rules import Breach, Breaches
 from rigidfleet.mission.values import Part, key, models_by_kind, required_key
@@ -36,7 +36,7 @@ class Solid(Part):
         """The shape, where its keys place it."""
 
     @property
-    def corners(self) -> tuple[float, ...] | None:
+    def box_bounds(self) -> tuple[float, ...] | None:
         """Lowest and highest corner (6,) [m] of a box along the world's axes at rest; None for all others."""
         return None
 
@@ -115,7 +115,7 @@ class Box(Moving):
     yaw_deg: values.Angle = key("yaw [deg]", 0.0)
 
     @property
-    def corners(self) -> tuple[float, ...] | None:
+    def box_bounds(self) -> tuple[float, ...] | None:
         """Lowest and highest corner (6,) [m]; None if the box is turned or moves."""
         if self.is_turned or len(self.motion[1]):
             return None
@@ -224,7 +224,7 @@ class Ground(Part):
         return False
 
     @property
-    def corners(self) -> tuple[float, ...] | None:
+    def box_bounds(self) -> tuple[float, ...] | None:
         """Lowest and highest corner (6,) [m] of a box that is infinite except at the top."""
         return (*(-math.inf,) * 3, math.inf, math.inf, self.height)
 
@@ -294,7 +294,7 @@ def _height_map_rules(m: FindingCollector, thing: Heights, path: Keys) -> Breach
         problem = f"has rows of {min(rows, default=0)} to {max(rows, default=0)} heights, {len(thing.heights)} of them"
         remedy = "give two rows or more, all of the same length, two or more"
         yield Breach("heights", problem, remedy, None)
-    elif why := missing_cells(thing.heights):
+    elif why := missing_cells_text(thing.heights):
         yield Breach("heights", why, FILL, None)
     elif count > bounds.HEIGHTS:
         problem = f"has {count:,} heights; the maximum is {bounds.HEIGHTS:,}"

@@ -53,7 +53,7 @@ def phase_rules(m: Draft) -> Breaches:
     phases = yield from _validate_phases(m)
     m.parts["phases"] = tuple(p for p in phases if p is not None)
     _check_phases(m, phases)
-    end = end_of_phases(m.phases) if m.is_valid((), "phases") else math.nan
+    end = latest_end_of_phases(m.phases) if m.is_valid((), "phases") else math.nan
     # With automatic durations it is not known; the mission is checked again when they are.
     m.end = None if math.isnan(end) else end
 
@@ -82,7 +82,7 @@ def _check_phases(m: Draft, phases: Written) -> None:
                 m.record_breaches(("phases", k), rules)
 
 
-def end_of_phases(phases: Sequence[AnyPhase]) -> float:
+def latest_end_of_phases(phases: Sequence[AnyPhase]) -> float:
     """Latest mission time [s] at which the last phase ends: each phase that settles takes its full timeout.
 
     It is nan if it depends on a duration that is automatic.
@@ -487,7 +487,7 @@ def _smoothness_rules(m: Draft, p: Phase, k: int) -> Breaches:
         return
     through = getattr(p, "through", ())
     if not m.is_smooth:
-        for key in [*p.automatic, *(["through"] if through else [])]:
+        for key in [*p.auto_keys, *(["through"] if through else [])]:
             problem = "needs a smooth mission" + (" to have a least time" if key in TIMES else "")
             yield Breach(key, problem, "add smoothness = 'jerk' at the top of the mission")
         return
@@ -508,7 +508,7 @@ def _smoothness_rules(m: Draft, p: Phase, k: int) -> Breaches:
         yield Breach("through", problem, "give all times or none", None)
     elif any(b <= a for a, b in itertools.pairwise(times)):
         yield Breach("through", "times must increase from point to point", "order them", None)
-    elif p.automatic:
+    elif p.auto_keys:
         problem = "has times, but the arrival is automatic"
         yield Breach("through", problem, "remove the times", None)
     elif isinstance(arrival, float) and times[-1] >= arrival:
@@ -518,7 +518,7 @@ def _smoothness_rules(m: Draft, p: Phase, k: int) -> Breaches:
 
 def _automatic_time_rules(m: Draft, p: Phase, k: int) -> Breaches:
     """Times that follow from the limits have limits to follow from."""
-    keys = [key for key in p.automatic if m.is_valid(("phases", k), key)]
+    keys = [key for key in p.auto_keys if m.is_valid(("phases", k), key)]
     if not keys or not m.is_smooth:
         return
     if p.control != "tracking":
@@ -550,7 +550,7 @@ def _arrival_rules(m: Draft, p: Phase) -> Breaches:
         yield Breach("settle", "a smooth way needs a time of arrival", remedy, None)
     elif m.is_valid((), "lqr"):
         for key, weights, used in (
-            ("lqr", m.lqr, "position" in steering.meets),
+            ("lqr", m.lqr, "position" in steering.commanded_at_arrival),
             ("lqr.attitude", m.lqr.attitude, steering.attitude_deg is not None),
         ):
             if used and weights.horizon == "finite":

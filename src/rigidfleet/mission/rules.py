@@ -74,7 +74,7 @@ class Draft(FindingCollector):
         """Whether acceleration and jerk of the references are to be continuous."""
         return self.smoothness == "jerk"
 
-    def one_per_agent(self, part: Any, key: str, *where: str, alone: str = "") -> Breaches:
+    def one_per_agent_rules(self, part: Any, key: str, *where: str, alone: str = "") -> Breaches:
         """A list has one entry per agent; ``alone`` says what else may stand in its place."""
         entries = getattr(part, key)
         if isinstance(entries, tuple) and self.n not in (None, len(entries)):

@@ -248,7 +248,7 @@ class Constraint(Part):
 
     alpha: values.Gain = key("alpha [1/s], > 0; the feedback gain of dc/dt is 2 alpha", 3.0)
     beta: values.Gain = key("beta [1/s], > 0; the feedback gain of c is beta^2", math.sqrt(12))
-    gamma: Annotated[float, Strict(), values.signed_number(GAIN, 3)] = key(
+    gamma: Annotated[float, Strict(), values.signed_number_field(GAIN, 3)] = key(
         "feedback gain of the integral of c [1/s^3], >= 0, < 2 alpha beta^2", 8.0
     )
     stabilisation: Literal["pid", "none"] = key(
@@ -273,7 +273,7 @@ class Constraint(Part):
         "fade out smoothly",
         1e-3,
     )
-    deformation_damping: Annotated[float, Strict(), values.number_from_zero(GAIN)] = key(
+    deformation_damping: Annotated[float, Strict(), values.number_from_zero_field(GAIN)] = key(
         "damping of deformation velocities while no slots are tracked [1/s], >= 0", 1.0
     )
 
@@ -321,7 +321,7 @@ class Tracking(Part):
 
     Q: values.Weights = key("weights [position error, velocity error], the first > 0", (4.0, 4.0))
     R: values.Cost = key("weight of the acceleration, > 0", 1.0)
-    integral: Annotated[float, Strict(), values.number_from_zero(GAIN)] = key(
+    integral: Annotated[float, Strict(), values.number_from_zero_field(GAIN)] = key(
         "gain of the integral of the position error [1/s^3], >= 0; frozen while a vehicle saturates; only "
         "with [vehicles]",
         0.0,
@@ -512,7 +512,7 @@ class Limits(Part):
     )
 
     @property
-    def separation_always(self) -> float | None:
+    def separation_at_all_heights(self) -> float | None:
         """Minimum separation at all altitudes [m]; None if there is none."""
         return self.separation if self.separation_altitude is None else None
 
@@ -648,7 +648,7 @@ class Network(Part):
         "links lost for good during the flight: `lost = [{ between = [1, 2], time = 30.0 }]`", ()
     )
 
-    def sent_rate(self, n: int) -> float:
+    def broadcast_rate(self, n: int) -> float:
         """Broadcasts of each of n vehicles a second [Hz] that the medium carries."""
         return self.rate if self.budget is None else min(self.rate, self.budget / n)
 
@@ -768,7 +768,7 @@ class MissionHeader(Part):
         "more of a distance above each other than beside",
         1.0,
     )
-    gravity: Annotated[float, Strict(), values.number_from_zero(ACCELERATION)] = key(
+    gravity: Annotated[float, Strict(), values.number_from_zero_field(ACCELERATION)] = key(
         "gravity [m/s^2], >= 0", 9.81
     )
     output_step: values.Time = key("time between samples of the result [s]", 0.05)

@@ -21,8 +21,8 @@ from rigidfleet.mission.draft import (
     MOST_AGENTS,
     align_comments,
     blend_time,
+    check_shape_name,
     output_step,
-    shape_known,
 )
 from rigidfleet.typing import Floats
 
@@ -61,7 +61,7 @@ def shape_scene(shape: str, agents: int, spacing: float) -> ShowFormation:
     ValueError
         There is no such shape, or not for this number of agents.
     """
-    shape_known(shape)
+    check_shape_name(shape)
     if not 0.0 < spacing < math.inf:
         raise ValueError(f"the spacing must be a positive length, not {spacing:g}")
     size = [spacing] * shapes.SHAPES[shape].sizes

@@ -68,24 +68,24 @@ def read_text(path: str | Path) -> str:
     except FileNotFoundError:
         raise MissionError([_unknown_mission(origin)]) from None
     except IsADirectoryError:
-        raise read_error(origin, "is a folder", "give the path of a mission file in it") from None
+        raise text_error(origin, "is a folder", "give the path of a mission file in it") from None
     except PermissionError:
         problem = "cannot be read: permission denied"
-        raise read_error(origin, problem, "change its permissions") from None
+        raise text_error(origin, problem, "change its permissions") from None
     except (OSError, ValueError) as error:
         problem = f"cannot be read ({error})"
-        raise read_error(origin, problem, "give the path of a mission file") from None
+        raise text_error(origin, problem, "give the path of a mission file") from None
     remedy = "give the path of a mission file (TOML)"
     if len(data) > bounds.BYTES:
-        raise read_error(origin, f"is larger than {bounds.BYTES >> 20} MiB", remedy)
+        raise text_error(origin, f"is larger than {bounds.BYTES >> 20} MiB", remedy)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         remedy = remedy if b"\0" in data else "save it as UTF-8"
-        raise read_error(origin, f"is not UTF-8 text (byte {error.start + 1})", remedy) from None
+        raise text_error(origin, f"is not UTF-8 text (byte {error.start + 1})", remedy) from None
 
 
-def read_error(origin: str, problem: str, remedy: str) -> MissionError:
+def text_error(origin: str, problem: str, remedy: str) -> MissionError:
     """The error of a text that cannot be read."""
     return MissionError([Finding(origin, "", None, problem, remedy)])
 
@@ -104,8 +104,8 @@ def parse_toml(text: str, origin: str) -> dict[str, Any]:
     MissionError
         The text is not valid TOML or exceeds the bounds on the text of a mission.
     """
-    if beyond := bounds.excess_in_words(text):
-        raise read_error(origin, beyond, "reduce it; docs/missions.md lists the bounds")
+    if beyond := bounds.toml_excess_in_words(text):
+        raise text_error(origin, beyond, "reduce it; docs/missions.md lists the bounds")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -118,4 +118,4 @@ def parse_toml(text: str, origin: str) -> dict[str, Any]:
         remedy = "correct it; toml.io describes the format"
     except RecursionError:
         problem, remedy = "is nested too deeply", "use the keys of a mission"
-    raise read_error(origin, problem, remedy)
+    raise text_error(origin, problem, remedy)

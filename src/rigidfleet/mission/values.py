@@ -37,36 +37,36 @@ Number = Annotated[float, Strict(), Field(ge=-HUGE, le=HUGE)]
 Positive = Annotated[float, Strict(), Field(gt=0, le=HUGE)]
 
 
-def signed_number(bound: Bound, power: int = 1) -> Any:
+def signed_number_field(bound: Bound, power: int = 1) -> Any:
     """A number of either sign within the bound, or its power."""
     return Field(ge=-(bound.most**power), le=bound.most**power)
 
 
-def _positive_number(bound: Bound) -> Any:
+def _positive_number_field(bound: Bound) -> Any:
     return Field(ge=bound.least, le=bound.most)
 
 
-def number_from_zero(bound: Bound) -> Any:
+def number_from_zero_field(bound: Bound) -> Any:
     """A number from zero up to the bound."""
     return Field(ge=0, le=bound.most)
 
 
-Coordinate = Annotated[float, Strict(), signed_number(LENGTH)]
-Length = Annotated[float, Strict(), _positive_number(LENGTH)]
-LengthOrZero = Annotated[float, Strict(), number_from_zero(LENGTH)]
-Time = Annotated[float, Strict(), _positive_number(TIME)]
+Coordinate = Annotated[float, Strict(), signed_number_field(LENGTH)]
+Length = Annotated[float, Strict(), _positive_number_field(LENGTH)]
+LengthOrZero = Annotated[float, Strict(), number_from_zero_field(LENGTH)]
+Time = Annotated[float, Strict(), _positive_number_field(TIME)]
 #: A time of the mission, from its start on.
-Seconds = Annotated[float, Strict(), number_from_zero(TIME)]
-Speed = Annotated[float, Strict(), _positive_number(SPEED)]
-Spread = Annotated[float, Strict(), number_from_zero(SPEED)]
-Acceleration = Annotated[float, Strict(), _positive_number(ACCELERATION)]
-Jerk = Annotated[float, Strict(), _positive_number(JERK)]
-Mass = Annotated[float, Strict(), _positive_number(MASS)]
-Angle = Annotated[float, Strict(), signed_number(ANGLE)]
-Gain = Annotated[float, Strict(), signed_number(GAIN)]
-Weight = Annotated[float, Strict(), number_from_zero(WEIGHT)]
-Cost = Annotated[float, Strict(), _positive_number(WEIGHT)]
-Tolerance = Annotated[float, Strict(), _positive_number(TOLERANCE)]
+Seconds = Annotated[float, Strict(), number_from_zero_field(TIME)]
+Speed = Annotated[float, Strict(), _positive_number_field(SPEED)]
+Spread = Annotated[float, Strict(), number_from_zero_field(SPEED)]
+Acceleration = Annotated[float, Strict(), _positive_number_field(ACCELERATION)]
+Jerk = Annotated[float, Strict(), _positive_number_field(JERK)]
+Mass = Annotated[float, Strict(), _positive_number_field(MASS)]
+Angle = Annotated[float, Strict(), signed_number_field(ANGLE)]
+Gain = Annotated[float, Strict(), signed_number_field(GAIN)]
+Weight = Annotated[float, Strict(), number_from_zero_field(WEIGHT)]
+Cost = Annotated[float, Strict(), _positive_number_field(WEIGHT)]
+Tolerance = Annotated[float, Strict(), _positive_number_field(TOLERANCE)]
 #: Infinity is allowed here; a later check rejects it with its own remedy.
 Limit = Annotated[float, Strict(), Field(ge=FORCE.least, allow_inf_nan=True)]
 Whole = Annotated[int, Strict(), Field(ge=-(2**31), lt=2**31)]
@@ -78,28 +78,28 @@ _T = TypeVar("_T")
 _Other = TypeVar("_Other")
 
 
-def _list_or_one(value: object) -> str:
+def _list_or_one_tag(value: object) -> str:
     return "list" if isinstance(value, list | tuple) else "one"
 
 
-def _word_or_one(value: object) -> str:
+def _word_or_one_tag(value: object) -> str:
     return "word" if isinstance(value, str) else "one"
 
 
 #: One value, or a list in its place; one value, or as many as there are agents; a value, or a word in its place.
 _OneOrList = Annotated[
-    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("list")], Discriminator(_list_or_one)
+    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("list")], Discriminator(_list_or_one_tag)
 ]
 _PerAgent = _OneOrList[_T, tuple[_T, ...]]
 _ValueOrWord = Annotated[
-    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("word")], Discriminator(_word_or_one)
+    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("word")], Discriminator(_word_or_one_tag)
 ]
 _Two, _Three = (Field(min_length=n, max_length=n) for n in (2, 3))
 Vector = Annotated[tuple[Coordinate, ...], _Three]
-Velocity = Annotated[tuple[Annotated[float, Strict(), signed_number(SPEED)], ...], _Three]
+Velocity = Annotated[tuple[Annotated[float, Strict(), signed_number_field(SPEED)], ...], _Three]
 #: A velocity, or "free": any.
 VelocityOrFree = _ValueOrWord[Velocity, Literal["free"]]
-Force = Annotated[tuple[Annotated[float, Strict(), signed_number(FORCE)], ...], _Three]
+Force = Annotated[tuple[Annotated[float, Strict(), signed_number_field(FORCE)], ...], _Three]
 Rates = Annotated[tuple[Angle, ...], _Three]
 Weights = Annotated[tuple[Weight, ...], _Two]
 Size = _OneOrList[Length, Annotated[tuple[Length, ...], _Three]]

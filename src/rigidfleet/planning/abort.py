@@ -37,9 +37,9 @@ from rigidfleet.planning.certificate import (
     Certificate,
     certificate_in_step,
     certificate_of,
-    of_ways,
+    prove_ways,
 )
-from rigidfleet.planning.clearance import greatest_way
+from rigidfleet.planning.clearance import greatest_shift
 from rigidfleet.planning.courses import ABOVE
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg
@@ -252,7 +252,7 @@ class Aborts:
         self.moves = any(x.solid.moves for x in mission.solids) or self.wrecked.size > 0
         start = mission.fleet.position
         below = mission.height_at(*start.T) + ABOVE + self.radius
-        self.stands = bool(mission.standing(start).all() and np.isfinite(below).all())
+        self.stands = bool(mission.is_standing(start).all() and np.isfinite(below).all())
         self.start = np.column_stack([start[:, :2], below])
         self._known: dict[bytes, Home] = {}
 
@@ -343,7 +343,7 @@ class Aborts:
             if self.lost.any():
                 proved = certificate_of(leg.phase, leg.reference, leg.radius, self.lost)
             if proved is None and len(self.left) > 1:  # no slots are tracked there
-                proved = self._apart(make(), self.left)
+                proved = self._prove_ways_of(make(), self.left)
             least = min(least, proved or least)
         # Its polynomials differ from the plan's ways by less than `CLOSE`.
         return self._step(name, make, least._replace(time=0.0), CLOSE, path=end)
@@ -391,13 +391,13 @@ class Aborts:
         """`shortest_time` of a step along the plan by a clock of a time; where the plan exceeds a limit, it counts."""
         share = np.linspace(0.0, 1.0, _LOOKS)
 
-        def excess(time: float) -> Floats:
+        def limit_ratios(time: float) -> Floats:
             at, *rates = clock(time).states(time * share, 4)
             states = self.plan.states(at, 4)
             allowed = np.maximum(self._limit_shares(limits, states), _USED)
             return self._limit_shares(limits, _states_by_clock(states, np.array(rates))) / allowed
 
-        return shortest_time(first, excess)
+        return shortest_time(first, limit_ratios)
 
     # -- what a step keeps --------------------------------------------------------------------------------
 
@@ -428,17 +428,17 @@ class Aborts:
         states = _rest_to_rest(start, end, 1.0).states(np.linspace(0.0, 1.0, _LOOKS), 4)
         allowed = np.maximum(self._limit_shares(self.home_limits, 0.0 * states), _USED)  # at rest
 
-        def excess(time: float) -> Floats:
+        def limit_ratios(time: float) -> Floats:
             moves = states * time ** -np.arange(4.0)[:, None, None, None]
             return self._limit_shares(self.home_limits, moves) / allowed
 
         lands = name == "down"
         longest = float(np.linalg.norm(end - start, axis=1).max())
-        time, _ = shortest_time(_FASTEST * longest / (DESCENT if lands else SPEED), excess)
+        time, _ = shortest_time(_FASTEST * longest / (DESCENT if lands else SPEED), limit_ratios)
         least = certificate_in_step(start, end, time, self.radius, self.lost) or _APART_FOR_EVER
         return self._step(name, partial(_rest_to_rest, start, end, time), least, 0.0, lands=lands)
 
-    def obstruction(self, step: Step, begin: float) -> str:
+    def obstruction_in_words(self, step: Step, begin: float) -> str:
         """What keeps a step from being flown, from a time [s] on; "" if nothing does.
 
         A step along the plan is where the plan is, but for obstacles that move.
@@ -456,7 +456,7 @@ class Aborts:
         v = way.states(np.linspace(0.0, step.duration, _LOOKS), 2)[1]
         far, when = step.duration * float(np.linalg.norm(v, axis=2).max()), np.array([begin])
         moved = (
-            greatest_way(x.solid, when, when + step.duration)[0] for x in things if x.solid.moves
+            greatest_shift(x.solid, when, when + step.duration)[0] for x in things if x.solid.moves
         )
         far += max(moved, default=0.0)
         time = np.linspace(0.0, step.duration, 2 + math.ceil(far / _PACE / 2.0))
@@ -492,9 +492,9 @@ class Aborts:
                 return f"'{thing}' stands in the way {step.name} of agent {left[i] + 1}"
         return ""
 
-    def _apart(self, way: Piecewise, who: Ints, first: int | None = None) -> Certificate:
-        """Certificate of the ways of some vehicles (n,), as `of_ways`."""
-        least = of_ways(way.time, way.pieces[:, who], self.radius[who], first)
+    def _prove_ways_of(self, way: Piecewise, who: Ints, first: int | None = None) -> Certificate:
+        """Certificate of the ways of some vehicles (n,), as `prove_ways`."""
+        least = prove_ways(way.time, way.pieces[:, who], self.radius[who], first)
         return least._replace(agents=tuple(who[list(least.agents)].tolist()))
 
     # -- ways home from rest ------------------------------------------------------------------------------
@@ -525,7 +525,7 @@ class Aborts:
             home = self.straight_ways_home(self.plan.at(np.array([path - far]))[0], begin + time)
             if home.way:
                 step = self.step_by_clock("back", clock(time))
-                if not self.obstruction(step, begin):
+                if not self.obstruction_in_words(step, begin):
                     yield Home((step, *home.steps), f"back along the plan, and {home.way}")
 
     def straight_ways_home(self, r: Floats, begin: float) -> Home:
@@ -541,10 +541,10 @@ class Aborts:
         for way in ("to any place",) if self.to == "any" else own:
             steps: list[Step] = []
             problem, t = "", begin
-            for name, a, b in self._landing_ways(way, r, goal, off):
+            for name, a, b in self._landing_step_ends(way, r, goal, off):
                 if np.abs(b - a).max() > 1e-9:
                     steps.append(self._straight_step(name, a, b))
-                    problem = problem or self.obstruction(steps[-1], t)
+                    problem = problem or self.obstruction_in_words(steps[-1], t)
                     t += steps[-1].duration
             if not problem:
                 return Home(tuple(steps), way)
@@ -552,7 +552,7 @@ class Aborts:
             reasons.append(f"{way}: {problem}")
         return Home(reason="; ".join(reasons))
 
-    def _landing_ways(
+    def _landing_step_ends(
         self, way: str, r: Floats, goal: Floats, off: float
     ) -> list[tuple[str, Floats, Floats]]:
         """Names of straight ways, from places to others (N, 3) [m] on the ground, if vehicles are off theirs [m].
@@ -563,7 +563,7 @@ class Aborts:
         p, q = r[left], goal[left]
         if way == "to any place":
             metric, goal = downwash_metric(_UP, self.below / self.apart), goal.copy()
-            q = self._free_places(r, q)
+            q = self._free_landing_places(r, q)
             goal[left] = q[assign_slots(p, q, turn=np.eye(3), metric=metric).order]
         if way == "by levels":
             height = _altitude_levels(self.apart + off, p, q) * (self.below + off)
@@ -577,7 +577,7 @@ class Aborts:
         above[left] += rise * _UP
         return [*stops, ("over the places", r, above), ("down", above, goal)]
 
-    def _free_places(self, r: Floats, own: Floats) -> Floats:
+    def _free_landing_places(self, r: Floats, own: Floats) -> Floats:
         """The own places (n, 3) of those left; where a lost vehicle lies on one, that of a lost one if it is free."""
         if not self.wrecked.size:
             return own
@@ -630,7 +630,7 @@ class Aborts:
         step, problem = self.slow_down(begins)
         if self.plan_lands and step.path is not None and step.path > self.plan_end - 1e-6:
             return Abort(ordered, begins, (step,), Home((), "lands as planned"))
-        if problem := problem or self.obstruction(step, begins):
+        if problem := problem or self.obstruction_in_words(step, begins):
             return Abort(ordered, begins, (step,), Home(reason=problem))
         home = self.way_home(step, begins + step.duration)
         return Abort(ordered, begins, (step, *home.steps), home, 0.0, step.duration)
@@ -661,9 +661,9 @@ class Aborts:
             if alone.why_no_way:
                 problem = alone.why_no_way
                 continue
-            make = partial(self._with_others, begins, waits, alone.steps)
+            make = partial(self._all_ways, begins, waits, alone.steps)
             way = make()
-            proved = self._apart(way, order, len(who))
+            proved = self._prove_ways_of(way, order, len(who))
             step = self._step("leave", make, min(proved, plan), 0.0)
             if (apart := proved.separation - step.off) < max(self.need, 1e-6):
                 problem = f"{agent_names(proved.agents)} come within {max(apart, 0.0):.2f} m"
@@ -675,7 +675,7 @@ class Aborts:
             return Abort(ordered, begins, (step,), home, waits, slow.duration)
         return Abort(ordered, begins, (), Home(reason=problem))
 
-    def _with_others(self, begins: float, waits: float, steps: Sequence[Step]) -> Piecewise:
+    def _all_ways(self, begins: float, waits: float, steps: Sequence[Step]) -> Piecewise:
         """The ways from a time on [s] of those that wait so long and then fly steps, and of the others, by the plan."""
         last = np.array([max(begins, self.plan_end - _TOUCHING), self.plan_end])
         states = self.plan.states(last, 4)

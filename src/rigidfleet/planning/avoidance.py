@@ -8,7 +8,7 @@ from rigidfleet.kernel import avoidance, fleet
 from rigidfleet.mission import Mission
 from rigidfleet.mission.avoidance import (
     extra_radii,
-    reaction_lags,
+    lag_coefficients,
     reaction_times,
     spare_accelerations,
 )
@@ -45,7 +45,7 @@ def avoidance_in_flight(
         clearance=settings.clearance,
         drag=drag,
         lag=reaction_times(models, mission.disturbances),
-        ahead=reaction_lags(models, mission.disturbances, mission.gravity),
+        ahead=lag_coefficients(models, mission.disturbances, mission.gravity),
         tilt=np.array(
             [np.inf if model.point else np.radians(model.tilt_limit_deg) for model in models]
         ),

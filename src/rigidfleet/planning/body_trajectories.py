@@ -37,11 +37,11 @@ def regulated_motion(
     Quintics between knots that are dense enough for the regulators are linear in the errors at the start, and in the
     goal, which goes on with its velocity.
     """
-    phi = att.vector_of(start.T @ goal.T.T)  # start = goal Exp(phi)
+    phi = att.single_rotation_vector(start.T @ goal.T.T)  # start = goal Exp(phi)
     length = arrival - t0
     times, responses = _lqr_curves(laws, tracking, length, t_end - arrival)
     x = *start.r.tolist(), *phi
-    v = *start.v.tolist(), *att.vector_rate(*phi, *start.omega.tolist())
+    v = *start.v.tolist(), *att.single_rotation_vector_rate(*phi, *start.omega.tolist())
     x1, v1 = (*goal.r.tolist(), 0.0, 0.0, 0.0), (*goal.v.tolist(), *goal.omega.tolist())
     each = zip(x, v, x1, v1, strict=True)
     ends = [part for a, b, c, d in each for part in (a - c + length * d, b - d, c, d)]

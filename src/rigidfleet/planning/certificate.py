@@ -73,7 +73,7 @@ def _prove_some(reference: Reference, radius: Floats, lost: Bools | None) -> Cer
         return None
     some = reference
     certificate = (
-        of_ways(some.knots, some.ways, radius) if len(some.knots) else of_blend(some, radius)
+        prove_ways(some.knots, some.ways, radius) if len(some.knots) else prove_blend(some, radius)
     )
     if certificate is None or left is None:
         return certificate
@@ -81,7 +81,7 @@ def _prove_some(reference: Reference, radius: Floats, lost: Bools | None) -> Cer
     return certificate._replace(agents=(i, j))
 
 
-def of_blend(reference: Reference, radius: Floats) -> Certificate | None:
+def prove_blend(reference: Reference, radius: Floats) -> Certificate | None:
     """Certificate of slots that blend: relative to the virtual body, all move straight and in step.
 
     How the virtual body moves and turns meanwhile does not matter to distances. None for a single agent.
@@ -108,7 +108,7 @@ def _closest_of_blend(p: bytes, dp: bytes, radius: bytes) -> tuple[float, tuple[
     return float(least[0]), (int(pairs[0, 0]), int(pairs[0, 1])), 0.0
 
 
-def of_ways(
+def prove_ways(
     knots: Floats, ways: Floats, radius: Floats | None = None, first: int | None = None
 ) -> Certificate:
     """Certificate of bent ways, polynomials (K, N, 3, P) between knots (K + 1,) [s], for radii (N,) [m] or points.

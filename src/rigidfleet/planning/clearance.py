@@ -104,7 +104,7 @@ class _Spans(NamedTuple):
         return _Spans(self.first[rows], self.length[rows], *kept, self.who[columns], self.halved)
 
 
-def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Floats) -> Closest:
+def clearance_to(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Floats) -> Closest:
     """Least clearance of a planned phase to an obstacle in continuous time.
 
     ``speed`` is the `speed_bounds` of the phase. Where the room between two samples might not do, the plan is evaluated
@@ -126,7 +126,7 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
         spans = todo.popleft()
         way = spans.speed * spans.length[:, None]
         if solid.moves:
-            way = way + greatest_way(solid, spans.first, spans.first + spans.length)[:, None]
+            way = way + greatest_shift(solid, spans.first, spans.first + spans.length)[:, None]
         low = 0.5 * (spans.near + spans.far - way)
         open_ = low < best - CLOSE
         if not open_.any():
@@ -174,7 +174,7 @@ def _path_while_present(
     return at, np.concatenate([first, planned.position[within], last]), speed[span]
 
 
-def greatest_way(solid: Solids, begin: Floats, end: Floats) -> Floats:
+def greatest_shift(solid: Solids, begin: Floats, end: Floats) -> Floats:
     """Greatest way (L,) [m] of a solid between times (L,) [s]: its greatest speed counts wherever it moves."""
     speed = np.linalg.norm(np.diff(solid.ways, axis=0), axis=1) / np.diff(solid.times)
     within = (solid.times[:-1] < end[:, None]) & (solid.times[1:] > begin[:, None])

@@ -85,7 +85,7 @@ def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Cour
     arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
     if now.goal is None:
         return Course(None, t_end, None)
-    r = now.goal.r if phase.place is None else np.array(phase.place)
+    r = now.goal.r if phase.rest_position is None else np.array(phase.rest_position)
     goal = copy_with(now.goal, r=r, v=np.zeros(3), omega=np.zeros(3))
     return _course_to(mission, phase, now, goal, arrival, t_end)
 
@@ -93,7 +93,7 @@ def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Cour
 def _reshape(mission: Mission, phase: Reshape, now: PhaseState, t_end: float) -> Course:
     """Stay, or go to the phase's own place; slots may go on bent ways."""
     rest = _stay(mission, phase, now, t_end)
-    if not phase.bent:
+    if not phase.has_bent_ways:
         return rest
     control, blend = np.array(phase.control_points), seconds(phase.blend)
     knots, ways = Piecewise.b_spline(control, blend)
@@ -102,20 +102,20 @@ def _reshape(mission: Mission, phase: Reshape, now: PhaseState, t_end: float) ->
 
 def _fly(mission: Mission, phase: Fly, now: PhaseState, t_end: float) -> Course:
     """Go to a waypoint, and perhaps an attitude."""
-    velocity = np.zeros(3) if phase.free else np.array(phase.velocity)
+    velocity = np.zeros(3) if phase.has_free_velocity else np.array(phase.velocity)
     return _steer(mission, phase, now, t_end, np.array(phase.position), velocity)
 
 
 def _turn(mission: Mission, phase: Turn, now: PhaseState, t_end: float) -> Course:
     """Turn to an attitude on the spot."""
-    return _steer(mission, phase, now, t_end, now.attached[1].r, np.zeros(3))
+    return _steer(mission, phase, now, t_end, now.pose_goal_slots[1].r, np.zeros(3))
 
 
 def _steer(
     mission: Mission, phase: Steering, now: PhaseState, t_end: float, r: Floats, v: Floats
 ) -> Course:
     """Go to a place (3,) with a velocity there and an attitude, within ``travel`` or by the end."""
-    _, before, _ = now.attached
+    _, before, _ = now.pose_goal_slots
     arrival = t_end if phase.travel is None else now.t + seconds(phase.travel)
     angles = phase.attitude_deg
     T = before.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
@@ -126,7 +126,7 @@ def _steer(
 
 def _orbit(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Course:
     """Fly a circle, and continue with its velocity. An attitude that turns along is not an explicitly specified one."""
-    pose, goal, _ = now.attached
+    pose, goal, _ = now.pose_goal_slots
     motion = orbit_motion(phase, pose, goal.T, now.t, t_end, smooth=mission.smooth)
     named = goal.named and not phase.turns_away
     return Course(copy_with(pose_at(motion, t_end), named=named), t_end, lambda: motion)
@@ -134,7 +134,7 @@ def _orbit(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Cou
 
 def _brake(mission: Mission, phase: Brake, now: PhaseState, t_end: float) -> Course:
     """Come to rest within ``travel`` or by the end, from the reference as it moves now."""
-    pose, before, _ = now.attached
+    pose, before, _ = now.pose_goal_slots
     arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
     motion = stopping_motion(pose, now.t, arrival)
     end = pose_at(motion, arrival)
@@ -150,10 +150,10 @@ def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) 
     Where each vehicle has a way of its own, the slots follow the same septic from rest to rest: together, each goes
     straight up or down by its own way, and one that stays, stays.
     """
-    pose, before, _ = now.attached
+    pose, before, _ = now.pose_goal_slots
     arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
     up, v, lift = np.zeros(3), np.zeros(3), None
-    if phase.each:
+    if phase.has_way_per_vehicle:
         rise, masses = climb_heights(mission, phase, now), mission.fleet.mass
         up[2] = masses @ rise / masses.sum()
         if np.ptp(rise) >= _LEVEL:
@@ -171,7 +171,7 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
 
     What the first point of a file differs from the place where the vehicles are fades over `_FADED`.
     """
-    pose, before, slots = now.attached
+    pose, before, slots = now.pose_goal_slots
     way = phase.pieces
     length = t_end - now.t if phase.travel is None else phase.travel
     scale = length / way.time[-1]
@@ -212,7 +212,7 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
     return Course(goal, arrival, lambda: motion, lift)
 
 
-def motion_conflict(phase: Any, now: PhaseState) -> str:
+def slot_motion_conflict_text(phase: Any, now: PhaseState) -> str:
     """What keeps a phase from going on with the motion of slots, where files have ended in it; "" if nothing."""
     goes_on = phase.control == "open" or (phase.follows_curves and phase.pieces[1].shape[1] > 1)
     if now.rates is None or goes_on:
@@ -223,16 +223,16 @@ def motion_conflict(phase: Any, now: PhaseState) -> str:
     return f"begins while agent {speed.argmax() + 1} goes on at {most:.2f} m/s beside the others"
 
 
-def course_conflict(phase: Any, now: PhaseState) -> str:
+def way_conflict_text(phase: Any, now: PhaseState) -> str:
     """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
     if phase.bent:
         first = np.array(phase.control_points)[0]
         if now.slots is None or not np.abs(first - now.slots).max() < _START_TOLERANCES[0]:
             return "begins in other slots than the phase before has led to"
-    return _vehicle_mismatch(phase, now) if phase.follows_curves else ""
+    return _trajectory_conflict_text(phase, now) if phase.follows_curves else ""
 
 
-def _vehicle_mismatch(phase: Follow, now: PhaseState) -> str:
+def _trajectory_conflict_text(phase: Follow, now: PhaseState) -> str:
     """What keeps the virtual body, or each vehicle, from following its trajectory."""
     if now.pose is None or now.slots is None:
         return ""
@@ -267,17 +267,17 @@ def _vehicle_mismatch(phase: Follow, now: PhaseState) -> str:
 
 def climb_heights(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     """How far [m] each vehicle (N,) goes up from the pose to hold: to a height, or (down) to just above the ground."""
-    (_, goal, slots), n = now.attached, mission.n_agents
-    place, ground = goal.r[2] + slots @ goal.T[:, 2], _heights_below(mission, now)
-    if phase.level is None:
+    (_, goal, slots), n = now.pose_goal_slots, mission.n_agents
+    place, ground = goal.r[2] + slots @ goal.T[:, 2], _surface_heights_below(mission, now)
+    if phase.arrival_height is None:
         up = np.minimum(ground + (ABOVE + mission.fleet.radius) - place, 0.0)
     else:
-        up = ground.max() + phase.level - place
+        up = ground.max() + phase.arrival_height - place
     goes = np.isin(np.arange(n), phase.movers(n))
     return np.where(goes if now.lost is None else goes & ~now.lost, up, 0.0)
 
 
-def _heights_below(mission: Mission, now: PhaseState) -> Floats:
+def _surface_heights_below(mission: Mission, now: PhaseState) -> Floats:
     """Height (N,) [m] of what is below each vehicle at the pose to hold; of a lost one, the least of the others'.
 
     Raises
@@ -285,7 +285,7 @@ def _heights_below(mission: Mission, now: PhaseState) -> Floats:
     MissionError
         There is nothing below a vehicle.
     """
-    _, goal, slots = now.attached
+    _, goal, slots = now.pose_goal_slots
     r = goal.r + slots @ goal.T
     heights = mission.height_at(*r.T)
     flying = np.ones(len(r), dtype=np.bool_) if now.lost is None else ~now.lost
@@ -299,10 +299,10 @@ def _heights_below(mission: Mission, now: PhaseState) -> Floats:
 
 def height_above_landing(mission: Mission, now: PhaseState) -> float:
     """How far [m] the lowest vehicle is above the height at which a landing ends, at the pose to hold."""
-    _, goal, slots = now.attached
+    _, goal, slots = now.pose_goal_slots
     left = np.ones(mission.n_agents, dtype=np.bool_) if now.lost is None else ~now.lost
     below = goal.r[2] + slots @ goal.T[:, 2] - mission.fleet.radius
-    return float(below[left].min() - _heights_below(mission, now).min()) - ABOVE
+    return float(below[left].min() - _surface_heights_below(mission, now).min()) - ABOVE
 
 
 def _course_to(
@@ -319,9 +319,9 @@ def _course_to(
         laws, tracking = regulators(mission, phase), mission.tracking
         way = partial(regulated_motion, laws, tracking, now.pose, goal, now.t, arrival, t_end)
         return Course(goal, arrival, way)
-    end = copy_with(goal, v=np.full(3, np.nan)) if phase.free else goal
+    end = copy_with(goal, v=np.full(3, np.nan)) if phase.has_free_velocity else goal
     motion = smooth_motion(now.pose, end, now.t, arrival, phase.points)
-    if phase.free:
+    if phase.has_free_velocity:
         goal = copy_with(goal, v=pose_at(motion, arrival).v)
     return Course(goal, arrival, lambda: motion)
 
@@ -329,7 +329,7 @@ def _course_to(
 def regulators(mission: Mission, phase: Phase | Steering) -> Lqr:
     """The regulators of the virtual body; those to a free velocity do not weigh it at the arrival."""
     laws = mission.lqr
-    return laws.model_copy(update={"S": (laws.S[0], 0.0)}) if phase.free else laws
+    return laws.model_copy(update={"S": (laws.S[0], 0.0)}) if phase.has_free_velocity else laws
 
 
 #: Function of each kind of phase that leads somewhere; in all others, the virtual body comes to rest.

@@ -24,7 +24,7 @@ def gauss_markov(white: Floats, step: float, tau: float) -> Floats:
     """
     x = white * math.sqrt(-math.expm1(-2.0 * step / tau))
     x[0] = white[0]
-    return _recursion(x, math.exp(-step / tau))
+    return _first_order_recursion(x, math.exp(-step / tau))
 
 
 def dryden_gust(white: Floats, step: float, tau: float) -> Floats:
@@ -38,14 +38,14 @@ def dryden_gust(white: Floats, step: float, tau: float) -> Floats:
     """
     s = step / tau
     a = math.exp(-s)
-    root, low, rest = _sample_weights(s)
+    root, low, rest = _noise_covariance_root(s)
     first, second = white[:, 0], white[:, 1]
     z1, z2 = root * first, low * first
     z2 += rest * second
     z1[0], z2[0] = first[0], 0.5 * (first[0] + second[0])
-    z1 = _recursion(z1, a)
+    z1 = _first_order_recursion(z1, a)
     z2[1:] += a * s * z1[:-1]
-    z2 = _recursion(z2, a)
+    z2 = _first_order_recursion(z2, a)
     z1 *= math.sqrt(3.0)
     z2 *= 1.0 - math.sqrt(3.0)
     z1 += z2
@@ -53,7 +53,7 @@ def dryden_gust(white: Floats, step: float, tau: float) -> Floats:
     return z1
 
 
-def _sample_weights(s: float) -> tuple[float, float, float]:
+def _noise_covariance_root(s: float) -> tuple[float, float, float]:
     """Shares of the first white sample in z1 and z2, and of the second one in z2: the lower root of P - A P A^T.
 
     The stationary covariances are P = [[1, 1/2], [1/2, 1/2]]. The entries are incomplete gamma functions: for a short
@@ -78,7 +78,7 @@ def _incomplete_gamma(n: int, x: float) -> float:
     return tail
 
 
-def _recursion(x: Floats, a: float) -> Floats:
+def _first_order_recursion(x: Floats, a: float) -> Floats:
     """Solve z_{k+1} = a z_k + x_{k+1} from z_0 = x_0; x and z (K, ...)."""
     from rigidfleet.kernel.engine import native  # loads the compiled kernel
 
@@ -98,14 +98,14 @@ def spline_coefficients(samples: Floats, scale: float = 1.0, part: int | None = 
     n, shape = len(samples), samples.shape[1 if part is None else 2 :]
     flat, width = np.ascontiguousarray(samples).reshape(n, -1), math.prod(shape)
     table = np.empty((n + 2, width))
-    c, (factors, shares) = table[1:-1], _elimination_factors(n)
+    c, (factors, shares) = table[1:-1], _tridiagonal_factors(n)
     native.run_scaled_recursions(flat, (part or 0) * width, scale * shares, c, factors)
     native.run_linear_recursion(c, factors, backward=True)
     table[0], table[-1] = 2.0 * c[0] - c[1], 2.0 * c[-1] - c[-2]
     return table.reshape(n + 2, *shape)
 
 
-def _elimination_factors(n: int) -> tuple[Floats, Floats]:
+def _tridiagonal_factors(n: int) -> tuple[Floats, Floats]:
     """Factors (n,) of the row before in either sweep of the elimination, and shares (n,) of the samples.
 
     Both ends are known: their factors are zero, and their shares one.

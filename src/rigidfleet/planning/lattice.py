@@ -52,15 +52,15 @@ class FreeSpace(NamedTuple):
 
         Beyond ``most`` (..., M) [m] the distance does not matter.
         """
-        least = self.room_to_obstacles(r, radius, most)
+        least = self.clearance_to_obstacles(r, radius, most)
         return np.minimum(least, np.minimum(r - self.fence[0], self.fence[1] - r).min(axis=-1))
 
-    def room_to_obstacles(self, r: Floats, radius: Floats, most: Floats | float) -> Floats:
+    def clearance_to_obstacles(self, r: Floats, radius: Floats, most: Floats | float) -> Floats:
         """The same from obstacles alone."""
         return proximity.obstacle_clearances(r, radius, self.obstacles, most=most)[0]
 
-    def encloses(self, a: Floats, b: Floats, path: Path, ways: Floats, need: float) -> Bools:
-        """Whether the fence leaves the room ``need`` [m] to motions (E,), which are those of `keeps_room`.
+    def is_inside(self, a: Floats, b: Floats, path: Path, ways: Floats, need: float) -> Bools:
+        """Whether the fence leaves the room ``need`` [m] to motions (E,), which are those of `is_clear`.
 
         Coordinates along a straight way are between those of its ends, however near the fence it runs. A path on the
         spot is the same wherever it is: it is looked at once, as finely as halvings would.
@@ -96,14 +96,14 @@ class Change(NamedTuple):
         return _CHANGE + float(self.ways.max())
 
 
-def keeps_room(
+def is_clear(
     space: FreeSpace, a: Floats, b: Floats, path: Path, ways: Floats, radius: Floats, need: float
 ) -> Bools:  # fmt: skip
     """Whether motions (E,) keep the room ``need`` [m]: from a to b (E, 3) [m], with offsets that follow a path.
 
     ``ways`` (M,) bounds what each ball flies relative to the centre of mass [m].
     """
-    free = space.encloses(a, b, path, ways, need)
+    free = space.is_inside(a, b, path, ways, need)
     way = np.linalg.norm(b - a, axis=1)[:, None] + ways
     who, length = np.flatnonzero(free), 1.0
     low = np.zeros(len(who))
@@ -111,7 +111,7 @@ def keeps_room(
         middle = low + length / 2
         place = a[who] + middle[:, None] * (b - a)[who]
         wanted = need + way[who] * length / 2
-        room = space.room_to_obstacles(place[:, None] + path(middle), radius, wanted)
+        room = space.clearance_to_obstacles(place[:, None] + path(middle), radius, wanted)
         free[who[(room < need).any(axis=1)]] = False
         open_ = free[who] & (room < wanted).any(axis=1)
         who, low, length = who[open_], low[open_], length / 2
@@ -166,7 +166,7 @@ class Lattice:
         edges = self.all_edges[:, free[self.all_edges].all(axis=0)]
         still = np.zeros(len(radius))
         a, b = self.points[edges[0]], self.points[edges[1]]
-        self.edges = edges[:, keeps_room(space, a, b, constant_path(layer), still, radius, need)]
+        self.edges = edges[:, is_clear(space, a, b, constant_path(layer), still, radius, need)]
         self.common = index[
             np.ix_(*(np.searchsorted(axes[k], common[k]) for k in range(3)))
         ].ravel()
@@ -245,14 +245,14 @@ class Roadmap:
                 free = one.free[one.common] & two.free[two.common]
                 a, b = one.common[free], two.common[free]
                 spots = one.points[a]
-                good = keeps_room(space, spots, spots, change.path, change.ways, radius, need)
+                good = is_clear(space, spots, spots, change.path, change.ways, radius, need)
                 a, b = a[good] + self.first[f, change.before], b[good] + self.first[f, change.after]
                 yield a, b, np.full(len(a), change.cost)
         for f in range(1, len(self.lattices)):
             for k, layer in enumerate(self.layers):
-                yield self._crossings(k, layer, f)
+                yield self._links_between_frames(k, layer, f)
 
-    def _crossings(self, k: int, layer: Layer, f: int) -> tuple[Ints, Ints, Floats]:
+    def _links_between_frames(self, k: int, layer: Layer, f: int) -> tuple[Ints, Ints, Floats]:
         """Straight ways of a layer between common places of the world's lattice and the nearest of another frame."""
         from scipy.spatial import KDTree
 
@@ -264,7 +264,7 @@ class Roadmap:
         a, b = np.repeat(a, near.shape[1]), b[near.ravel()]
         p, q = one.points[a], two.points[b]
         still = np.zeros(len(self.radius))
-        good = keeps_room(self.space, p, q, constant_path(layer), still, self.radius, self.need)
+        good = is_clear(self.space, p, q, constant_path(layer), still, self.radius, self.need)
         cost = np.linalg.norm(p - q, axis=1)[good]
         return a[good] + self.first[0, k], b[good] + self.first[f, k], cost
 
@@ -312,7 +312,7 @@ class Roadmap:
             if change is None or not np.array_equal(p, q):
                 return False
             path, ways = change.path, change.ways
-        return bool(keeps_room(self.space, p[None], q[None], path, ways, self.radius, self.need)[0])
+        return bool(is_clear(self.space, p[None], q[None], path, ways, self.radius, self.need)[0])
 
     def _straighten(self, stops: list[Stop]) -> list[Stop]:
         """From each stop on to the farthest one of its layer that is straight ahead."""
@@ -347,7 +347,7 @@ class Roadmap:
         ]
         return [s for s, again in zip(stops, alike, strict=True) if not again]
 
-    def _rooms_of_motions(self) -> Iterator[tuple[Ints, Ints, Floats]]:
+    def _motion_clearances(self) -> Iterator[tuple[Ints, Ints, Floats]]:
         """Nodes of the world's lattice that a motion or a change joins, proved or not, and the room there [m]."""
         row, first = self.lattices[0], self.first[0]
         for k, x in enumerate(row):
@@ -362,12 +362,12 @@ class Roadmap:
             room = np.minimum(one.room[a], two.room[b])
             yield a + first[change.before], b + first[change.after], room
 
-    def widest_way(self, begin: Stop, end: Stop) -> tuple[float, Floats, int]:
+    def way_of_most_clearance(self, begin: Stop, end: Stop) -> tuple[float, Floats, int]:
         """The most room [m] that a way between two nodes leaves everywhere, and place and layer where it is least."""
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-        tail, head, room = map(np.concatenate, zip(*self._rooms_of_motions(), strict=True))
+        tail, head, room = map(np.concatenate, zip(*self._motion_clearances(), strict=True))
         # Of places that are as narrow, the one nearest to the straight way.
         along = end[0] - begin[0]
         beside = np.cross(self.points[tail] - begin[0], along / max(np.linalg.norm(along), 1e-9))

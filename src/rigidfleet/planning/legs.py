@@ -274,7 +274,7 @@ def _attach_frame(
     goal = now.goal or copy_with(pose, v=np.zeros(3), omega=np.zeros(3))
     if establishing is not None and target is not None:
         # The new axes in the old ones: `axes` maps vectors from new to old.
-        free = mission.free_attitude(phase)
+        free = mission.leaves_attitude_free(phase)
         if free:
             axes = rigid_body.kabsch(slots, target, masses) if turn is None else turn
         else:

@@ -59,18 +59,18 @@ def limits_of(
 ) -> list[Limit]:
     """The limits that a mission sets to its references, or other ``limits`` in place of its own.
 
-    With ``reserve`` (N,) [s], quantities are the greatest that vehicles reach (`planning.vehicles.lag_times`).
+    With ``reserve`` (N,) [s], quantities are the greatest that vehicles reach (`planning.vehicles.overshoot_times`).
     """
     limits, n = limits or mission.limits, mission.n_agents
     mass, up = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
 
-    def reserve_of_order(order: int, x: Floats, who: Ints) -> Floats | float:
+    def lag_overshoot(order: int, x: Floats, who: Ints) -> Floats | float:
         if reserve is None or order + 1 >= x.shape[1]:
             return 0.0  # the jerk that counts is that of the slots
         return reserve[who] * np.linalg.norm(x[:, order + 1], axis=-1).max(axis=0)
 
-    def motion(q: Quantity, x: Floats, who: Ints) -> Floats:
-        return SIZES[q.way](x[:, q.order]) + reserve_of_order(q.order, x, who)
+    def motion_with_overshoot(q: Quantity, x: Floats, who: Ints) -> Floats:
+        return SIZES[q.way](x[:, q.order]) + lag_overshoot(q.order, x, who)
 
     def force_per_mass(x: Floats, who: Ints) -> Floats:
         """What a thrust gives per mass [m/s^2], against drag if vehicles leave a reserve."""
@@ -78,11 +78,11 @@ def limits_of(
         return x[:, 2] + up - air
 
     def tilt(_: Quantity, x: Floats, who: Ints) -> Floats:
-        f, off = force_per_mass(x, who), reserve_of_order(2, x, who)
+        f, off = force_per_mass(x, who), lag_overshoot(2, x, who)
         return np.rad2deg(np.arctan2(SIZES["horizontal"](f) + off, f[..., 2] - off))
 
     def thrust(_: Quantity, x: Floats, who: Ints) -> Floats:
-        return mass[who] * (SIZES[""](force_per_mass(x, who)) + reserve_of_order(2, x, who))
+        return mass[who] * (SIZES[""](force_per_mass(x, who)) + lag_overshoot(2, x, who))
 
     ways, finite = {"tilt": tilt, "thrust": thrust}, []
     for q in (*MOTIONS, QUANTITIES["tilt"], QUANTITIES["thrust"]):
@@ -90,7 +90,7 @@ def limits_of(
         most = mission.fleet.thrust_limit if table == "agents" else getattr(limits, key)
         if most is not None and np.isfinite(most).any():
             most = np.broadcast_to(np.asarray(most, dtype=float), n)
-            finite.append(Limit(q, most, partial(ways.get(q.way, motion), q)))
+            finite.append(Limit(q, most, partial(ways.get(q.way, motion_with_overshoot), q)))
     return finite
 
 

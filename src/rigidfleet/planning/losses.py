@@ -27,7 +27,7 @@ from rigidfleet.planning.abort import (
     shortest_time,
     state_to_leave,
 )
-from rigidfleet.planning.clearance import CLOSE, closest, speed_bounds
+from rigidfleet.planning.clearance import CLOSE, clearance_to, speed_bounds
 from rigidfleet.planning.courses import climb_heights, height_above_landing
 from rigidfleet.planning.legs import Leg, depart, leg_from, leg_of, phase_spans
 from rigidfleet.planning.limits import use_of_limits
@@ -71,7 +71,7 @@ def legs_from(
     return legs
 
 
-def answer_to(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg]]) -> Answer:
+def answer_to_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg]]) -> Answer:
     """What follows the loss of a vehicle or link, or the order to abort, from the state at that moment.
 
     Parameters
@@ -89,7 +89,7 @@ def answer_to(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg
 
 
 def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg]]) -> list[Leg]:
-    """The legs of the phases by which the others brake, and hold or land (`answer_to`)."""
+    """The legs of the phases by which the others brake, and hold or land (`answer_to_loss`)."""
     d = mission.disturbances
     assert d is not None
     rest = 0.0 if now.blend is None else now.blend.t0 + now.blend.T_b - now.t
@@ -150,7 +150,7 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
 def _hits_obstacle(mission: Mission, leg: Leg) -> bool:
     """Whether a leg leads a slot into an obstacle or the ground."""
     planned = planned_phase(leg, FEWEST_SAMPLES)
-    near = (closest(planned, x, leg.radius, speed_bounds(planned)) for x in mission.obstacles)
+    near = (clearance_to(planned, x, leg.radius, speed_bounds(planned)) for x in mission.obstacles)
     return any(x.clearance < -CLOSE for x in near)
 
 
@@ -164,11 +164,11 @@ def _shortest_leg(
     limits = gentle_limits(mission, acceleration=BRAKING, jerk=JERK)
     departure = depart(mission, make(least), now)
 
-    def shares(time: float, end: float = math.inf) -> Floats:
+    def limit_shares(time: float, end: float = math.inf) -> Floats:
         leg = leg_from(mission, make(time), departure)
         use = use_of_limits(limits, leg.reference, leg.motion, now.t, min(leg.end, end))
         return np.array([x.share for x in use])
 
-    allowed = np.maximum(shares(least, now.t + 1e-9 * max(1.0, now.t)), 1.0)
-    time, _ = shortest_time(least, lambda time: shares(time) / allowed, _KEPT)
+    allowed = np.maximum(limit_shares(least, now.t + 1e-9 * max(1.0, now.t)), 1.0)
+    time, _ = shortest_time(least, lambda time: limit_shares(time) / allowed, _KEPT)
     return leg_from(mission, make(time), departure)

@@ -106,7 +106,7 @@ class PhasePlan(Leg):
     @property
     def target_record(self) -> dict[str, Any] | None:
         """What the phase is to reach, or the attitude of a formation established, for the record."""
-        goal, meets, lies = self.goal, self.phase.meets, self.lies
+        goal, meets, lies = self.goal, self.phase.commanded_at_arrival, self.lies
         if goal is None or not (meets or lies):
             return None
         turns = lies or "attitude" in meets
@@ -121,7 +121,7 @@ class PhasePlan(Leg):
             **({"through": list(self.through)} if self.through else {}),
         }
 
-    def stay_target(self, t: float) -> dict[str, Any] | None:
+    def end_state_record(self, t: float) -> dict[str, Any] | None:
         """What the phase promises of its end at t [s] beside its target; None for nothing.
 
         A phase that stays comes to rest, and keeps the attitude commanded before if it tracks slots. Another one goes
@@ -130,7 +130,7 @@ class PhasePlan(Leg):
         goal, since, phase = self.goal, t - self.arrival, self.phase
         if goal is None or phase.control == "open":
             return None
-        meets, later = phase.meets, since > _LATER
+        meets, later = phase.commanded_at_arrival, since > _LATER
         stays, free = "position" not in meets, "velocity" not in meets
         kept = stays and goal.named and phase.control == "tracking" and phase.establishing is None
         table: dict[str, Any] = {"time": t}
@@ -248,7 +248,7 @@ def plan_phase(
     elif phase.control == "body":
         assert leg.goal is not None
         feedback = _feedback(mission, phase, leg.goal, leg.start, leg.arrival)
-    held = _formation_in_shape(mission, name, now) if method == "dense" else None
+    held = _name_if_in_formation(mission, name, now) if method == "dense" else None
     problem = Problem(
         body_formulation=mission.formulation == "body",
         has_frame=leg.frame is not None,
@@ -267,14 +267,14 @@ def plan_phase(
         feedback=feedback,
         control=_control_of_phase(mission, phase, masses),
         disturbance=no_disturbance(masses) if disturbance is None else disturbance,
-        external=_limit_steps(external or External(), motion, reference),
+        external=_limit_force_steps(external or External(), motion, reference),
     )  # fmt: skip
     if mission.agents.fixed:
         problem = with_fixed_agents(problem, np.array(mission.agents.fixed) - 1)
     plan = copy_as(
         PhasePlan, leg, reference=reference, masses=masses, problem=problem, edges=edges, distances=d1,
         attached=leg.before.slots is not None or phase.control != "open",
-        lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
+        lies=phase.establishing is not None and not mission.leaves_attitude_free(phase), method=method,
         integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, links_lost=mission.links_lost,
         loses=min(mission.first_loss, mission.abandons_at) < math.inf,
@@ -288,7 +288,7 @@ def plan_phase(
     return plan
 
 
-def _limit_steps(external: External, motion: Motion, reference: Reference) -> External:
+def _limit_force_steps(external: External, motion: Motion, reference: Reference) -> External:
     """A user's force, if any, with steps of at most half the time for which any coordinate of a reference accelerates.
 
     Only after a rest or a uniform motion, where steps grow without bound: they could miss what comes between two.
@@ -330,7 +330,7 @@ def _constraint_graph(edges: bytes, masses: bytes, *, large: bool) -> Graph:
     return graph(pairs, np.frombuffer(masses), large=large)
 
 
-def _formation_in_shape(mission: Mission, name: str | None, now: PhaseState) -> str | None:
+def _name_if_in_formation(mission: Mission, name: str | None, now: PhaseState) -> str | None:
     """The formation, if the remaining agents are in it: all pairs within a tenth of the shortest distance."""
     slots = mission.formation_slots(name) if name else None
     if slots is None:

@@ -17,12 +17,12 @@ from rigidfleet.mission.findings import Keys
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import ways
 from rigidfleet.planning.body_trajectories import points_passed
-from rigidfleet.planning.courses import course_conflict, motion_conflict
+from rigidfleet.planning.courses import slot_motion_conflict_text, way_conflict_text
 from rigidfleet.planning.legs import Departure, Leg, depart, leg_from, state_at_start
 from rigidfleet.planning.limits import Limit, Reached, limits_of, use_of_limits
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.transitions import expand_phases
-from rigidfleet.planning.vehicles import lag_times
+from rigidfleet.planning.vehicles import overshoot_times
 
 #: Shortest and longest time tried [s], and the number of times tried.
 _SHORTEST, _LONGEST, _TRIES = 0.1, 1e5, 60
@@ -80,7 +80,7 @@ def complete_times(mission: Mission) -> Mission:
     """
     mission = expand_mission(mission)
     last = max(
-        (k for k, phase in enumerate(mission.phases) if phase.automatic or phase.follows_curves),
+        (k for k, phase in enumerate(mission.phases) if phase.auto_keys or phase.follows_curves),
         default=None,
     )
     if last is None:
@@ -88,7 +88,7 @@ def complete_times(mission: Mission) -> Mission:
     tables = mission.to_dict()["phases"]
     now = state_at_start(mission)
     for k, phase in enumerate(mission.phases[: last + 2]):
-        if problem := motion_conflict(phase, now):
+        if problem := slot_motion_conflict_text(phase, now):
             remedy = "let the trajectories before end at rest, or let those of each vehicle go on"
             raise ways.error_of_key(mission, k, "kind", None, problem, remedy)
         if k > last:
@@ -96,7 +96,7 @@ def complete_times(mission: Mission) -> Mission:
         report_step(f"timing '{phase.name}'")
         leg = timed_leg(mission, phase, now, k)
         if leg.phase is not phase:
-            changed = leg.phase.model_dump(mode="json", include={*phase.automatic, "through"})
+            changed = leg.phase.model_dump(mode="json", include={*phase.auto_keys, "through"})
             tables[k] = tables[k] | {key: x for key, x in changed.items() if x or key != "through"}
         if not leg.has_known_ways:
             problem = "depends on distances alone, so that the starts of later phases are known only in flight"
@@ -118,21 +118,21 @@ def timed_leg(mission: Mission, phase: Phase, now: PhaseState, number: int) -> L
         No time keeps the limits, or the phase follows given ways that begin elsewhere.
     """
     departure = depart(mission, phase, now)
-    if problem := course_conflict(phase, departure.now):
+    if problem := way_conflict_text(phase, departure.now):
         key = "file" if phase.follows_curves else "formation"
         remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
         raise ways.error_of_key(mission, number, key, None, problem, remedy)
-    if not phase.automatic:
+    if not phase.auto_keys:
         return leg_from(mission, phase, departure)
     phase = _with_point_times(mission, phase, departure)
     shortest, vary = _SHORTEST, partial(_with_travel, phase)
     if phase.duration == AUTO and phase.shaping is not None and phase.shaping.blend != AUTO:
         shortest, vary = phase.shaping.least_time, partial(_with_duration, phase)
-    time, worst = _least(mission, vary, departure, shortest)
+    time, worst = _min_time(mission, vary, departure, shortest)
     if time is None:
         problem = f"no time keeps the limits of the mission: {reached_in_words(worst, phase)}"
         remedy = f"raise {worst.limit.of.key}, or change the way"
-        raise ways.error_of_key(mission, number, phase.automatic[0], AUTO, problem, remedy)
+        raise ways.error_of_key(mission, number, phase.auto_keys[0], AUTO, problem, remedy)
     if time > shortest:
         time = math.ceil(time * _MARGIN / _UNIT - 1e-9) * _UNIT
     return leg_from(mission, vary(round(time, 6)), departure)
@@ -145,7 +145,7 @@ def least_time(mission: Mission, leg: Leg) -> tuple[str, float | None]:
     """
     length = {"until": None, "settle": None, "duration": leg.end - leg.start}
     phase = _with_point_times(mission, leg.phase.model_copy(update=length), leg.departure)
-    time, _ = _least(mission, partial(_with_travel, phase), leg.departure, _SHORTEST)
+    time, _ = _min_time(mission, partial(_with_travel, phase), leg.departure, _SHORTEST)
     return phase.time_key, time
 
 
@@ -166,7 +166,7 @@ def reached_in_words(worst: Reached, phase: Phase) -> str:
     )
 
 
-def _least(
+def _min_time(
     mission: Mission,
     vary: Callable[[float], Phase],
     departure: Departure,
@@ -177,8 +177,8 @@ def _least(
 
     Vehicles leave a reserve of their limits, unless no time does: of a circle near a limit, for example.
     """
-    if limits is None and (reserve := lag_times(mission)).any():
-        fastest = _least(mission, vary, departure, shortest, limits_of(mission, reserve=reserve))
+    if limits is None and (reserve := overshoot_times(mission)).any():
+        fastest = _min_time(mission, vary, departure, shortest, limits_of(mission, reserve=reserve))
         if fastest[0] is not None:
             return fastest
     limits = limits_of(mission) if limits is None else limits
@@ -187,7 +187,7 @@ def _least(
         leg = leg_from(mission, vary(time), departure)
         return use_of_limits(limits, leg.reference, leg.motion, leg.start, leg.end, fine=fine)
 
-    def excess(time: float) -> float:
+    def greatest_limit_share(time: float) -> float:
         """Greatest share of a limit [-], as a power that falls in proportion to the time of ways from rest to rest."""
         return max(x.share ** (1 / x.limit.of.order) for x in reached_at(time))
 
@@ -195,7 +195,7 @@ def _least(
     low, high, time = 0.0, math.inf, max(_TRIAL, shortest)
     before = math.inf
     for _ in range(_TRIES):
-        over = excess(time)
+        over = greatest_limit_share(time)
         if time > _STEP / 2 * low > 0.0 and over > _STALLED * before:
             low = time  # a longer time does not help: the state at the start, or a circle, is beyond the limit
             break

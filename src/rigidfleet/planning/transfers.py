@@ -5,7 +5,7 @@ duration, from rest to rest. Their control points minimise penalties of what is 
 samples, the box, speed and acceleration; then the ways are proved. Speed and acceleration of a B-spline are bounded by
 differences of its control points, so that limits per axis and the box hold between samples, too. The distance of pairs
 is bounded in continuous time by conservative advancement on the ways themselves
-(`rigidfleet.planning.certificate.of_ways`).
+(`rigidfleet.planning.certificate.prove_ways`).
 
 The penalty methods are those of trajectory optimisation with B-splines, e.g. Zhou et al., Robust and efficient
 quadrotor trajectory generation for fast autonomous flight, IEEE RA-L 4(4), 2019.
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from rigidfleet.formation.assignment import closest_approach
 from rigidfleet.math.piecewise import CUBIC, Piecewise
-from rigidfleet.planning.certificate import Certificate, of_ways
+from rigidfleet.planning.certificate import Certificate, prove_ways
 from rigidfleet.typing import Floats
 
 #: Spans of a way between its knots; samples of each span at which distances are penalised, or so many that the longest
@@ -113,15 +113,15 @@ def plan_transfer(
     least_time = max(least_duration(s, g, limits.speed, limits.acceleration), _SHORTEST)
     for duration in (slower * least_time for slower in _SLOWER):
         for start_number in range(_STARTS + 2):
-            control = _straight_controls(s, g)
+            control = _straight_control_points(s, g)
             if start_number > _STARTS:  # as in a roundabout, for crowds that all meet at one place
-                control = _improve(_ways_to_the_right(s, g), duration, limits, rng)
+                control = _descend(_right_hand_control_points(s, g), duration, limits, rng)
             elif start_number:  # straight ways will not do
-                control = _improve(control, duration, limits, rng)
+                control = _descend(control, duration, limits, rng)
             if not _keeps_limits(control, duration, limits):
                 continue
             knots, pieces = Piecewise.b_spline(control, duration)
-            certificate = of_ways(knots, pieces * metric[:, None])
+            certificate = prove_ways(knots, pieces * metric[:, None])
             if certificate.separation >= distance:
                 return Transfer(control, duration, certificate)
     return None
@@ -147,13 +147,13 @@ def _b_spline_weights(u: Floats, spans: int) -> Floats:
     return B
 
 
-def _straight_controls(s: Floats, g: Floats) -> Floats:
+def _straight_control_points(s: Floats, g: Floats) -> Floats:
     """Control points (M + 3, N, 3) of straight ways. The first and last three are equal, for rest at the ends."""
     share = np.clip((np.arange(_SPANS + 3) - 2) / (_SPANS - 2), 0.0, 1.0)[:, None, None]
     return (1 - share) * s + share * g
 
 
-def _ways_to_the_right(s: Floats, g: Floats) -> Floats:
+def _right_hand_control_points(s: Floats, g: Floats) -> Floats:
     """Control points (M + 3, N, 3) of ways that all keep to the right, seen from above on half an ellipse.
 
     Where each vehicle goes to the opposite place of a circle, this is half a turn of them all.
@@ -164,7 +164,7 @@ def _ways_to_the_right(s: Floats, g: Floats) -> Floats:
     return s + 0.5 * (1.0 - np.cos(np.pi * share)) * way + np.sin(np.pi * share) * right
 
 
-def _improve(control: Floats, duration: float, limits: _Limits, rng: np.random.Generator) -> Floats:
+def _descend(control: Floats, duration: float, limits: _Limits, rng: np.random.Generator) -> Floats:
     """Control points (M + 3, N, 3) with little penalty, from those of other ways; their ends stay."""
     from scipy.optimize import minimize
 

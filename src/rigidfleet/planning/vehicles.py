@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel import fleet
-from rigidfleet.kernel.clock_records import FASTEST, OFF, RATE, VehicleClocks, same_clock
+from rigidfleet.kernel.clock_records import FASTEST, OFF, RATE, VehicleClocks, shared_clock
 from rigidfleet.kernel.mail import Links, no_network
 from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
 from rigidfleet.math import series
-from rigidfleet.math.margins import Lag, LoopGains, overshoot_time
+from rigidfleet.math.margins import Lag, LoopGains, tracking_error_gain
 from rigidfleet.math.quadrotor import ROTORS
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import VehicleModel
@@ -112,8 +112,8 @@ def vehicle_lags(mission: Mission) -> list[Lag]:
     ]
 
 
-def lag_times(mission: Mission) -> Floats:
-    """Times T (N,) [s] by which each vehicle leaves its reference at most (`margins.overshoot_time`); 0 for points.
+def overshoot_times(mission: Mission) -> Floats:
+    """Times T (N,) [s] by which a vehicle leaves its reference at most (`margins.tracking_error_gain`); 0 for points.
 
     Its acceleration differs by up to T times the reference's greatest jerk, its velocity by up to T times the greatest
     acceleration.
@@ -125,7 +125,7 @@ def lag_times(mission: Mission) -> Floats:
         if not model.point:
             left = _LEFT * max(model.linear_drag)
             drag = left if tracking.drag_feedforward else model.linear_drag[0]
-            times[i] = overshoot_time(lags[i], law, drag / model.mass)
+            times[i] = tracking_error_gain(lags[i], law, drag / model.mass)
     return times
 
 
@@ -150,7 +150,7 @@ def jet_speeds(mission: Mission, r: Floats) -> Floats:
     for j, model in enumerate(mission.vehicle_models or ()):
         if not model.point:
             hover = model.mass * mission.gravity, DENSITY, model.rotor_radius, 2.0 * model.arm
-            speed = fleet.jet_speed(*hover, np.maximum(s[..., j], 0.0), beside[..., j])
+            speed = fleet.downwash_speed(*hover, np.maximum(s[..., j], 0.0), beside[..., j])
             flow[..., j] = np.where(s[..., j] > 0.0, speed, 0.0)
     return flow
 
@@ -198,7 +198,7 @@ def network_of(mission: Mission) -> Links:
         return no_network(n)
     links, reverse = links_of(mission.edges)
     worsens, recovers = loss_transitions(net.loss, net.burst)
-    every, jitter = max(1, round(rate / net.sent_rate(n))), round(net.jitter * rate)
+    every, jitter = max(1, round(rate / net.broadcast_rate(n))), round(net.jitter * rate)
     delay, silence = max(1, round(net.delay * rate)), max(1, round(net.silence * rate))
     # As many messages within the time of silence as are all lost once in a thousand times, and two at least.
     tries = math.ceil(math.log(_ALL_LOST) / math.log(1.0 - recovers)) if recovers < 1.0 else 1
@@ -247,10 +247,10 @@ def clocks_of(mission: Mission) -> VehicleClocks:
     net, d, n = mission.network, mission.disturbances, mission.n_agents
     clocks, stuck = None if net is None else net.clocks, () if d is None else d.stuck
     if net is None or not (clocks or stuck):
-        return same_clock(n)
+        return shared_clock(n)
     rate = mission.autopilot.rate
     rows = [[x.agent - 1, round(x.time * rate), round((x.time + x.duration) * rate)] for x in stuck]
-    made = same_clock(n)._replace(own=True, stuck=np.array(rows, dtype=np.int64).reshape(-1, 3))
+    made = shared_clock(n)._replace(own=True, stuck=np.array(rows, dtype=np.int64).reshape(-1, 3))
     if clocks is None:
         return made
 

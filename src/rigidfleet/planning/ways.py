@@ -23,7 +23,7 @@ from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import ANGLES, Go
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import layers
-from rigidfleet.planning.clearance import closest, speed_bounds
+from rigidfleet.planning.clearance import clearance_to, speed_bounds
 from rigidfleet.planning.lattice import FreeSpace, Layer, Roadmap, Way, constant_path
 from rigidfleet.planning.legs import Leg, latest_end, state_at_start
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
@@ -203,10 +203,10 @@ class _Search:
 
     # -- from nodes to phases --------------------------------------------------------------------------
 
-    def _parts(self, roadmap: Roadmap, way: Way) -> Iterator[tuple[str, dict[str, Any], float]]:
+    def _phases(self, roadmap: Roadmap, way: Way) -> Iterator[tuple[str, dict[str, Any], float]]:
         """Name, keys and greatest way [m] of an agent, of each phase of a way."""
         changes = {frozenset((c.before, c.after)): float(c.ways.max()) for c in roadmap.changes}
-        written = self._names_in_file()
+        written = self._formation_names_in_file()
         for (a, i), (b, j) in pairwise(zip(way.places, way.layers, strict=True)):
             layer = roadmap.layers[j]
             if i == j:
@@ -220,7 +220,7 @@ class _Search:
                 keys: dict[str, Any] = {"kind": "turn"} | _attitude_keys(layer.angles)
                 yield f"turn to {layer.angles[2]:.4g}°", keys, changes[frozenset((i, j))]
 
-    def _names_in_file(self) -> dict[str, str]:
+    def _formation_names_in_file(self) -> dict[str, str]:
         """Names of formations as the file has them, by those that they have here."""
         tables = self.mission.to_dict()["phases"]
         return {
@@ -232,7 +232,7 @@ class _Search:
     def _phase_tables(self, roadmap: Roadmap, way: Way) -> list[dict[str, Any]]:
         """The phases of a way as tables; times are shared like the roots of the longest ways, or automatic."""
         phase = self.phase
-        parts = list(self._parts(roadmap, way))
+        parts = list(self._phases(roadmap, way))
         if not parts:
             parts = [("stay", {"kind": "fly", "position": self.end.tolist()}, 1.0)]
         end = latest_end(phase, self.now.t)
@@ -291,7 +291,7 @@ class _Search:
         speed, need, radius = speed_bounds(planned), self.phase.clearance, mission.fleet.radius
         least = math.inf
         for thing in mission.obstacles:
-            clearance, agent, time, proved = closest(planned, thing, radius, speed)
+            clearance, agent, time, proved = clearance_to(planned, thing, radius, speed)
             if proved < least:
                 least = proved
                 self._worst = (
@@ -312,15 +312,15 @@ class _Search:
         """What stands in the way, and how much is missing."""
         mistake = partial(self.mistake, "position", self.phase.position)
         for what, place, layer in (("start", self.begin, 0), ("goal", self.end, self._last)):
-            room, agent, thing = self._tightest(roadmap, place, layer)
+            room, agent, thing = self._least_gap(roadmap, place, layer)
             if room < roadmap.need:
                 problem = (
                     f"its {what} leaves agent {agent + 1} {room:.2f} m of clearance from {thing}, which is less"
                     f" than {self.phase.clearance:g} m"
                 )
                 return mistake(problem, "move it, or ask for less clearance")
-        least, place, layer = roadmap.widest_way((self.begin, 0), (self.end, self._last))
-        x, (_, _, thing) = roadmap.layers[layer], self._tightest(roadmap, place, layer)
+        least, place, layer = roadmap.way_of_most_clearance((self.begin, 0), (self.end, self._last))
+        x, (_, _, thing) = roadmap.layers[layer], self._least_gap(roadmap, place, layer)
         where = ", ".join(f"{v:z.2f}" for v in place)
         problem = (
             f"no way is found: at the narrowest place of the best one, ({where}) m, '{x.formation}' at yaw"
@@ -332,7 +332,7 @@ class _Search:
         remedy = "allow a slimmer formation (formations, scales), ask for less clearance, or name points on the way"
         return mistake(problem, remedy)
 
-    def _tightest(self, roadmap: Roadmap, place: Floats, layer: int) -> tuple[float, int, str]:
+    def _least_gap(self, roadmap: Roadmap, place: Floats, layer: int) -> tuple[float, int, str]:
         """The least room [m] of an agent at a place, the agent, and what is nearest to it."""
         r, space = place + roadmap.layers[layer].offsets, roadmap.space
         room = space.room_at(r, roadmap.radius)

@@ -26,7 +26,7 @@ _ARROW = 0.35
 _DRAWN = 3
 
 
-def formation_graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
+def formation_graphs_figure(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
     """Graph of each formation with its rigidity; arrows show the first free motions, each in a tone of its own."""
     names = list(mission.formations)
     with st.apply_style():
@@ -37,7 +37,7 @@ def formation_graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) ->
 
 
 def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: Path) -> None:
-    """Write `formation_graphs` to a file, completely or not at all.
+    """Write `formation_graphs_figure` to a file, completely or not at all.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: P
         raise ResultError(
             f"{path}: the name has no figure format. Give a name that ends in {known}."
         )
-    (drawn,) = encode_figure(formation_graphs(mission, judged), [path.suffix[1:]]).values()
+    (drawn,) = encode_figure(formation_graphs_figure(mission, judged), [path.suffix[1:]]).values()
     write_file(path, drawn, parents=True)
 
 

@@ -91,7 +91,7 @@ def off_plan(result: Result) -> OffPlan | None:
     return OffPlan(np.where(result.left, off, np.nan), doubt, limit)
 
 
-def log_names(result: Result) -> list[str]:
+def vehicle_names_in_log(result: Result) -> list[str]:
     """Names of the vehicles of a log, as their files have them."""
     return [st.clean_name(x) for x in result.statistics["names"]]
 
@@ -101,12 +101,12 @@ def plan_and_flight(result: Result) -> Figure:
     """The plan (dashed) and the flight from above, and how far vehicles are from their slots, with what is in doubt."""
     fig = st.blank_figure(st.WIDTH, 3.9, "constrained")
     above, below = fig.subplots(1, 2, width_ratios=(0.8, 1.2))
-    st.draw_head(fig, result, "The flight against its plan")
+    st.draw_flight_heading(fig, result, "The flight against its plan")
     off = off_plan(result)
     assert off is not None  # there are bands
     n, time, slots = result.n_agents, result.time, result.slot_position
     st.draw_time_axis(below, result)
-    colours, names = st.agent_colours(n), log_names(result)
+    colours, names = st.agent_colours(n), vehicle_names_in_log(result)
     # Of many vehicles, those that are off the most.
     shown = np.sort(np.argsort(-np.fmax.reduce(off.far, axis=0))[:_SHOWN]).tolist()
     low, high = 1e3 * off.distance_interval

@@ -29,7 +29,7 @@ def messages(result: Result) -> Figure:
     below.set_ylabel("sum of all\nconstraint forces [N]")
     net = result.mission.network
     assert net is not None
-    age = oldest_messages(result)
+    age = oldest_message_ages(result)
     Panel(above, result, age, "s").draw()
     st.draw_agents_legend(above, result.n_agents)
     if net.silence < 2.0 * np.nanmax(age, initial=0.0):
@@ -43,7 +43,7 @@ def messages(result: Result) -> Figure:
     return fig
 
 
-def oldest_messages(result: Result) -> Floats:
+def oldest_message_ages(result: Result) -> Floats:
     """Age (K, N) of the oldest of the newest messages that each agent has of its neighbours [s]; NaN without any."""
     assert result.message_age is not None
     age = np.full((result.n_agents, len(result.time)), np.nan)

@@ -52,7 +52,7 @@ def summary(result: Result) -> Figure:
     It has the trajectory, the view from above, distances (without edges: separation), attitude, thrust and clearance.
     """
     fig = st.blank_figure(11.4, 7.0)
-    st.draw_head(fig, result, st.clean_name(result.mission.title, 80) or "Flight")
+    st.draw_flight_heading(fig, result, st.clean_name(result.mission.title, 80) or "Flight")
     view = space.trajectory_scene(result)
     space.draw_trajectory_in_space(fig, result, view, (0.0, 0.49, 0.41, 0.47))
     space.draw_trajectory_from_above(fig.add_axes((0.45, 0.56, 0.22, 0.36)), result, view)

@@ -50,7 +50,7 @@ def tilt(result: Result) -> Floats:
     return np.where(known, samples(result, "tilt").values, np.nan)
 
 
-def _nearest_to_limit(result: Result, limits: Floats) -> Extremum | None:
+def _rotor_nearest_to_limit(result: Result, limits: Floats) -> Extremum | None:
     """The rotor that comes nearest to its limit between samples; its ``other`` is the rotor."""
     every = [p.extremes["rotor_force"] for p in result.phases if "rotor_force" in p.extremes]
     return max(every, key=lambda x: x.value / limits[x.who], default=None)
@@ -72,7 +72,7 @@ def _draw_greatest_rotor(ax: Axes, result: Result) -> None:
     limits = rotor_limits(result.mission)
     share, between = (
         100.0 * rotor_forces(result).max(axis=2) / limits,
-        _nearest_to_limit(result, limits),
+        _rotor_nearest_to_limit(result, limits),
     )
     if between is not None:
         between = between._replace(value=100.0 * between.value / limits[between.who], other=-1)
@@ -85,7 +85,7 @@ def _draw_rotors_of_nearest(ax: Axes, result: Result) -> None:
     limits, force = rotor_limits(result.mission), rotor_forces(result)
     peak = np.fmax.reduce(force, axis=(0, 2)) / limits
     i = int(np.nanargmax(peak))
-    e = _nearest_to_limit(result, limits)
+    e = _rotor_nearest_to_limit(result, limits)
     if e is not None and e.value / limits[e.who] > peak[i]:
         i = e.who
     colours = st.colour_scale(4)

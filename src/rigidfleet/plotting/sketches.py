@@ -39,7 +39,7 @@ def sketch_places(mission: Mission, name: str) -> tuple[Floats, bool]:
     d = shortest_path(coo_array((lengths, edges.T), (n, n)), directed=False)
     # Between components that no edge joins
     d[np.isinf(d)] = 1.5 * d[np.isfinite(d)].max(initial=1.0)
-    value, vector = distance_geometry.scale_distances(d)
+    value, vector = distance_geometry.classical_scaling(d)
     places = np.zeros((n, 3))
     places[:, : min(n, 3)] = (vector * np.sqrt(np.maximum(value, 0)))[:, ::-1][:, :3]
     return places, False
@@ -64,7 +64,7 @@ def formations(result: Result) -> Figure:
     names = list(result.mission.formations)
     legend = len(result.edges) > curves.SINGLE
     fig, axes = tiled_figure(len(names), 0.4, 0.7 * legend)
-    st.draw_head(fig, result, "Formations with their body axes")
+    st.draw_flight_heading(fig, result, "Formations with their body axes")
     for ax, name in zip(axes, names, strict=True):
         _draw_formation(ax, result, name)
     if legend:
@@ -86,7 +86,7 @@ def _draw_formation(ax: Axes, result: Result, name: str) -> None:
     drawn = draw_formation_sketch(ax, mission, name, of_edge, words, most=curves.SINGLE)
     if drawn.placed and mission.n_agents > 1 and not mission.formation_colours(name):
         share = (0.3, 0.3, 0.42, 0.5)[distance_geometry.dimension(drawn.p, 1e-3)]
-        _draw_axes(ax, drawn.turn.T, share * float(np.linalg.norm(drawn.p, axis=1).max()))
+        _draw_body_axes(ax, drawn.turn.T, share * float(np.linalg.norm(drawn.p, axis=1).max()))
 
 
 class Sketch(NamedTuple):
@@ -211,7 +211,7 @@ def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str], shown: Seque
     ax.scatter(*p[order, :2].T, s=2000 / len(p) + 1, c=dots[order], linewidths=0, zorder=3)
 
 
-def _draw_axes(ax: Axes, axes: Floats, length: float) -> None:
+def _draw_body_axes(ax: Axes, axes: Floats, length: float) -> None:
     """Draw body axes from the centre of mass; rows of `axes` (3, 3), the last column towards the viewer.
 
     One that points to the viewer is a ring with a dot, beside the centre, where an agent may be.

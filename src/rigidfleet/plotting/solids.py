@@ -60,7 +60,7 @@ def drawn_obstacles(
     near_obstacles = []
     for thing in mission.solids:
         solid, surface = thing.solid, outline_of_solid(thing.solid)
-        if plain := thing.corners is not None and not thing.zone:
+        if plain := thing.box_bounds is not None and not thing.zone:
             surface = Outline(*(np.clip(x, low, high) for x in surface))
         at = way = np.zeros((1, 3))
         if solid.moves:
@@ -121,7 +121,7 @@ def draw_obstacle_in_space(ax: Axes3D, shape: DrawnObstacle) -> None:
         ax.plot(*way.T, color=colour, linewidth=1.0, linestyle=(0, (1, 1.5)), zorder=2.2)
 
 
-def seen_from_above(triangles: Floats) -> Path:
+def area_from_above(triangles: Floats) -> Path:
     """The area that triangles (T, 3, 3) [m] cover as they are seen from above."""
     from matplotlib.path import Path
 
@@ -158,7 +158,7 @@ def draw_obstacle_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     corner = Path([low, [high[0], low[1]], high])
     for at, share in zip(shape.at, _opacities(shape), strict=True):
         opacity = 0.0 if shape.is_terrain else 0.3 if not shape.zone else 0.1
-        path = corner if shape.is_terrain else seen_from_above(shape.surface.triangles + at)
+        path = corner if shape.is_terrain else area_from_above(shape.surface.triangles + at)
         patch = ax.add_patch(PathPatch(path, **look, alpha=opacity * float(share)))
         if shape.zone:
             lines = list((shape.surface.lines + at)[..., :2])

@@ -11,8 +11,8 @@ import numpy as np
 from rigidfleet.plotting import areas, solids
 from rigidfleet.plotting import style as st
 from rigidfleet.result import Result
-from rigidfleet.result.lights import has_lights, lights
-from rigidfleet.result.lights import view_angles as seen
+from rigidfleet.result.lights import angles_facing_formation as seen
+from rigidfleet.result.lights import has_lights, light_colours
 from rigidfleet.solids.records import box_corners
 from rigidfleet.typing import Floats
 
@@ -90,7 +90,7 @@ def _waypoints(result: Result) -> list[tuple[str, Floats]]:
     return [(name, np.array(place)) for place, name in names.items()]
 
 
-def _names_of_places(view: Scene, axes: int) -> list[tuple[str, Floats]]:
+def _waypoint_names_by_place(view: Scene, axes: int) -> list[tuple[str, Floats]]:
     """Names of the waypoints, of those joined that are at one place as it is seen in 2 or 3 axes."""
     near, joined = (
         _ONE_PLACE * np.linalg.norm(view.high - view.low),
@@ -122,15 +122,15 @@ def _drawn_samples(result: Result, rows: Any) -> list[int]:
     usable = set(rows.tolist())
     kept = [int(rows[0])]
 
-    def keep(candidates: list[int], gap: float) -> None:
+    def keep_if_apart(candidates: list[int], gap: float) -> None:
         for k in candidates:
             apart = np.sqrt(np.mean(np.sum((r[k] - r[kept]) ** 2, axis=2), axis=1))
             if k in usable and apart.min() > gap:
                 kept.append(k)
 
-    keep([int(rows[-1])], 1e-3 * size)
-    keep(ends, 0.3 * size)
-    keep(rows[st.spaced_indices(len(rows), 80)].tolist(), max(1.2 * size, path / 14))
+    keep_if_apart([int(rows[-1])], 1e-3 * size)
+    keep_if_apart(ends, 0.3 * size)
+    keep_if_apart(rows[st.spaced_indices(len(rows), 80)].tolist(), max(1.2 * size, path / 14))
     return sorted(kept)
 
 
@@ -155,7 +155,7 @@ def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
         path: dict[str, Any] = {"color": colours[i], "linewidth": width, "alpha": alpha}
         ax.plot(*view.paths[:, i, :axes].T, **path, zorder=3, gid=f"agent-{i + 1}")
     if night:
-        shown = lights(result, result.time[view.shots]).reshape(-1, 3)
+        shown = light_colours(result, result.time[view.shots]).reshape(-1, 3)
         look: dict[str, Any] = {"depthshade": False} if axes == 3 else {}
         r = shots.reshape(-1, axes)
         ax.scatter(*r.T, s=5, c=shown, linewidths=0, zorder=5, gid="lights", **look)
@@ -184,7 +184,7 @@ def _waypoint_look(result: Result) -> dict[str, Any]:
     return st.marker_look(colour, 7, marker="+") | {"markeredgewidth": 1.3}
 
 
-def _name_look(result: Result) -> dict[str, Any]:
+def _waypoint_name_look(result: Result) -> dict[str, Any]:
     """Look of the name of a waypoint, with an outline in the colour of the background."""
     from matplotlib.patheffects import withStroke
 
@@ -230,8 +230,8 @@ def draw_trajectory_in_space(
     if len(edges):
         ax.add_collection3d(Line3DCollection(edges, colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 3)
-    for names, place in _names_of_places(view, 3):
-        ax.text(*place, f"  {names}", va="bottom", **_name_look(result))
+    for names, place in _waypoint_names_by_place(view, 3):
+        ax.text(*place, f"  {names}", va="bottom", **_waypoint_name_look(result))
     ax.view_init(elevation, azimuth)
     _fit_axes(fig, ax, view, rect)
     return ax
@@ -249,7 +249,7 @@ def _set_ticks(ax: Axes3D) -> None:
     ax.patch.set_visible(False)
 
 
-def _on_screen(ax: Axes3D, points: Floats) -> Floats:
+def _screen_positions(ax: Axes3D, points: Floats) -> Floats:
     """Screen positions (n, 2) [pixels] of points (n, 3)."""
     from mpl_toolkits.mplot3d.proj3d import proj_transform
 
@@ -266,7 +266,7 @@ def _fit_axes(
     side, margin = max(width, height), 0.55 * fig.dpi  # for tick and axis labels
     corner = left + (width - side) / 2, bottom + (height - side) / 2
     ax.set_position((*(corner / size), *(side / size)))
-    extent = np.ptp(_on_screen(ax, box_corners(view.low, view.high)), axis=0)
+    extent = np.ptp(_screen_positions(ax, box_corners(view.low, view.high)), axis=0)
     zoom = min((width - 2 * margin) / extent[0], (height - 2 * margin) / extent[1])
     ax.set_box_aspect([float(s) for s in view.high - view.low], zoom=zoom)
 
@@ -297,11 +297,11 @@ def draw_trajectory_from_above(ax: Axes, result: Result, view: Scene) -> None:
     edges = _edge_segments(result, view.shots)[..., :2]
     ax.add_collection(LineCollection(list(edges), colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 2)
-    for names, (x, y, _) in _names_of_places(view, 2):
+    for names, (x, y, _) in _waypoint_names_by_place(view, 2):
         side, away = (
             ("right", -5) if x > view.high[0] - 0.2 * np.ptp(ax.get_xlim()) else ("left", 5)
         )
-        look = {"textcoords": "offset points", "ha": side, **_name_look(result)}
+        look = {"textcoords": "offset points", "ha": side, **_waypoint_name_look(result)}
         ax.annotate(names, (x, y), (away, 4), **look)
 
 
@@ -322,7 +322,7 @@ def trajectory(result: Result) -> Figure:
     """Paths of the vehicles, and the formation at selected times."""
     wide = st.figure_width(10.5)
     fig = st.blank_figure(wide, 2.2 * wide if st.is_narrow() else 6.2)
-    st.draw_head(fig, result, "Trajectory")
+    st.draw_flight_heading(fig, result, "Trajectory")
     view = trajectory_scene(result)
     entries = trajectory_handles(result, view)
     columns = max(1, min(len(entries), max(int(0.9 * wide), 2) if st.is_narrow() else 11))

@@ -88,7 +88,7 @@ def figure_of(
 ) -> Callable[[Draw], Draw]:
     """Draw a figure in our style; where what it shows is not there, say that there is ``nothing``, if that is given."""
 
-    def mark(draw: Draw) -> Draw:
+    def decorate(draw: Draw) -> Draw:
         @wraps(draw)
         def draw_in_style(result: Result, *more: Any, **named: Any) -> Figure:
             with apply_style():
@@ -102,7 +102,7 @@ def figure_of(
         vars(draw_in_style)["there"] = there
         return draw_in_style
 
-    return mark
+    return decorate
 
 
 @contextmanager
@@ -176,7 +176,7 @@ def time_figure(
     axes = fig.subplots(
         rows, columns, sharex=True, squeeze=False, height_ratios=shares, gridspec_kw=grid
     )
-    draw_head(fig, result, title)
+    draw_flight_heading(fig, result, title)
     for ax in axes.flat:
         draw_time_axis(ax, result)
     for ax in axes[-1]:
@@ -192,7 +192,7 @@ def phase_targets(result: Result) -> list[tuple[PhaseRecord, dict[str, Any]]]:
     return [(p, at) for p, target in reached for at in (*target.get("through", ()), target)]
 
 
-def draw_head(fig: Figure, result: Result, title: str) -> None:
+def draw_flight_heading(fig: Figure, result: Result, title: str) -> None:
     """Title at the left; at the right, the mission and, if the flight is incomplete, when it stopped."""
     words, colour = result.mission.name, GREY
     if not result.complete:

@@ -15,7 +15,7 @@ from rigidfleet.mission import Mission, as_mission
 from rigidfleet.mission.files import notes_on_files
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview_phases, samples_per_phase
 from rigidfleet.planning.timing import complete_times
-from rigidfleet.planning.vehicles import lag_times, vehicle_lags
+from rigidfleet.planning.vehicles import overshoot_times, vehicle_lags
 from rigidfleet.preflight import trajectory
 from rigidfleet.preflight.assignment import assignment_remarks
 from rigidfleet.preflight.avoidance import braking_remarks
@@ -60,7 +60,7 @@ def check(
     preflight = Preflight(mission, formations, check_gains(mission, formations), planned)
     preflight.speed = trajectory.greatest_speed(planned, slice(3))
     preflight.vertical_speed = trajectory.greatest_speed(planned, slice(2, 3))
-    preflight.thrust = trajectory.greatest_thrust(mission, planned)
+    preflight.thrust = trajectory.thrust_nearest_to_limit(mission, planned)
     if not known:
         preflight.judged_to = float(planned[-1].time[-1]) if planned else 0.0
     if lags := vehicle_lags(mission):
@@ -68,10 +68,10 @@ def check(
         preflight.margins = check_margins(mission, planned, lags)
         preflight.network = check_network(mission, planned, lags)
         preflight.vehicles = check_vehicles(mission, planned)
-        preflight.reserve = float(lag_times(mission).max()) if mission.smooth else 0.0
+        preflight.reserve = float(overshoot_times(mission).max()) if mission.smooth else 0.0
     progress("collisions, obstacles and limits")
     preflight.remarks = [
-        *(Remark("note", "files", text) for text in notes_on_files(mission.about)),
+        *(Remark("note", "files", text) for text in notes_on_files(mission.file_digests_text)),
         *formation_remarks(mission, formations),
         *gain_remarks(mission, preflight),
         *margin_remarks(preflight),
@@ -79,7 +79,7 @@ def check(
         *trajectory.separation_remarks(mission, preflight),
         *trajectory.downwash_remarks(mission, preflight),
         *assignment_remarks(mission, preflight),
-        *trajectory.step_remarks(mission, preflight),
+        *trajectory.reference_step_remarks(mission, preflight),
         *vehicle_remarks(mission, preflight),
         *braking_remarks(mission),
         *trajectory.disturbance_remarks(mission, preflight),
@@ -90,7 +90,7 @@ def check(
         *trajectory.waypoint_remarks(mission, preflight),
         *loss_remarks(mission, preflight),
     ]
-    if planned and (words := mission.landings_in_words(planned[-1].position[-1])):
+    if planned and (words := mission.landing_swaps_in_words(planned[-1].position[-1])):
         preflight.remarks.append(Remark("note", "landing", words))
     if not known:
         why = "later positions depend on distances alone and are known only in flight"

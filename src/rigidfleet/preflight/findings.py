@@ -223,7 +223,7 @@ class FormationNetwork:
         return min(self, other, key=lambda f: (f.bears_network, f.delay_ticks, f.loss or 0.0))
 
     @property
-    def row(self) -> dict[str, Any]:
+    def table_row(self) -> dict[str, Any]:
         """What it bears and what it has, by the names of columns; losses are stable in mean square."""
         ms, bears = 1e3 * self.tick_s, None if self.loss is None else 100 * self.loss
         return {
@@ -331,7 +331,7 @@ class Preflight(Shown):
     margins : what lag and delay the laws bear; None if vehicles have none
     network : what delay and loss of messages each formation bears, by its name; empty without a network
     vehicles : what the planned paths ask of rotors; None if vehicles have none
-    reserve : of the limits, what automatic times leave for lag and drag of vehicles (`planning.vehicles.lag_times`) [s]
+    reserve : of the limits, what automatic times leave for lag and drag of vehicles [s] (`vehicles.overshoot_times`)
     judged_to : mission time [s] up to which paths were checked; infinite if they all were
     remarks : problems and notes
 
@@ -397,7 +397,7 @@ class Preflight(Shown):
         """Facts, each with its heading: formations, gains, planned paths. `remarks` are separate."""
         for table in self._tables():
             heads = [("", "") if table.bare else (x, unit) for x, unit, _ in table.columns[1:]]
-            for heading, *texts in table.texts:
+            for heading, *texts in table.cell_texts:
                 cells = zip(heads, texts, strict=True)
                 yield heading, ", ".join(f"{x} {y} {unit}".strip() for (x, unit), y in cells if y)
 
@@ -414,7 +414,7 @@ class Preflight(Shown):
         ]  # fmt: skip
         return [
             *tables,
-            table_of([{"network": name} | f.row for name, f in self.network.items()]),
+            table_of([{"network": name} | f.table_row for name, f in self.network.items()]),
             FactTable(words, [*map(Row, self._headed_sentences())], words, bare=True),
             table_of(ways if len(ways) > 1 else []),
             table_of_worst_values("planned", self._worst_facts()),

@@ -28,7 +28,7 @@ from rigidfleet.rigidity import (
     spectrum,
 )
 from rigidfleet.rigidity.analysis import WHERE, flatten_points
-from rigidfleet.rigidity.realisations import follow_lengths
+from rigidfleet.rigidity.realisations import deform_to_lengths
 from rigidfleet.rigidity.spectrum import MOST as LANCZOS
 from rigidfleet.typing import Floats
 
@@ -55,11 +55,11 @@ def check_formations(
     mission: Mission, *, search: bool, progress: Callable[[str], None]
 ) -> list[FormationCheck]:
     """Check all formations and return them in their order. Those that are flown have priority if work is limited."""
-    held = {name: _held_by(mission, name) for name in mission.formations}
+    held = {name: _holding_control(mission, name) for name in mission.formations}
     left, checks = _FORMING, {}
     for k, name in enumerate(sorted(held, key=lambda name: held[name] == "nothing"), start=1):
         progress(f"formation '{name}', {k} of {len(held)}")
-        work = _work_time(mission, name, search=search)
+        work = _estimated_check_time(mission, name, search=search)
         skipped = k > 1 and work > left
         left -= 0.0 if skipped else work
         check = _check_formation(mission, name, held[name], search=search, skipped=skipped)
@@ -67,7 +67,7 @@ def check_formations(
     return [checks[name] for name in mission.formations]
 
 
-def _work_time(mission: Mission, name: str, *, search: bool) -> float:
+def _estimated_check_time(mission: Mission, name: str, *, search: bool) -> float:
     """Estimated time to check a formation [s]."""
     n, m = mission.n_agents, len(mission.formation_edges(name))
     if min(m, 3 * n) > DENSE:
@@ -109,7 +109,7 @@ def _check_formation(
     return replace(check, realisations=others)
 
 
-def _held_by(mission: Mission, name: str) -> _Held:
+def _holding_control(mission: Mission, name: str) -> _Held:
     """What holds a formation in the phases that have it."""
     now, controls = None, set()
     for phase in mission.phases:
@@ -206,7 +206,7 @@ def _flat_start_remarks(mission: Mission) -> Iterator[Remark]:
         if phase.control != "open":
             if formed:
                 return  # slots lead anywhere
-            turned |= "attitude" in phase.meets
+            turned |= "attitude" in phase.commanded_at_arrival
             continue
         # Equal forces accelerate unequal masses differently.
         moves.append(unequal * np.array([phase.input_force]))
@@ -248,7 +248,7 @@ def _flexibility_forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[
             pairs = complete_graph(len(r))
             apart = distance_geometry.distances(slots, pairs)
             edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
-            end = None if torn else follow_lengths(r, edges, lengths, 1e-6 * apart.min(), slots)
+            end = None if torn else deform_to_lengths(r, edges, lengths, 1e-6 * apart.min(), slots)
             most = _SURELY["shape" if phase.shaping is None else phase.shaping.reference]
             most *= mission.formations[name].greatest_error(apart.min())
             off, before = np.inf, out.get(name, (0, 0.0))

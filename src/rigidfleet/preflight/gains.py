@@ -20,7 +20,7 @@ def check_gains(mission: Mission, formations: list[FormationCheck]) -> GainsChec
     over = None if settling is None else pid.overshoot(c.alpha, c.beta, c.gamma)
     mass, stiffness = float(np.mean(mission.agents.mass)), c.beta**2 * stabilised
     force = {
-        f.name: f.rigidity.force(stiffness, mass)
+        f.name: f.rigidity.constraint_force_bound(stiffness, mass)
         for f in formations
         if f.rigidity is not None and f.rigidity.rank
     }

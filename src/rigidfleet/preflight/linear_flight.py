@@ -142,12 +142,12 @@ class LinearFlight:
     def _equation_inverses(self, grip: Floats, who: Ints) -> Floats:
         """Inverses (K, W, W) of the equations of some vehicles, whose edges have the ``grip`` (K, W).
 
-        As in `neighbours.solve_own_edges`, an edge that slips has a larger entry on the diagonal.
+        As in `neighbours.solve_own_constraint_force`, an edge that slips has a larger entry on the diagonal.
         """
         rows = grip[:, :, None] * self._coupling[who] + self._diagonal[who]
         return np.linalg.inv(rows) * grip[:, None]
 
-    def _slipping_ends(self, grip: Floats) -> tuple[Ints, Ints, Floats]:
+    def _slipping_inverses(self, grip: Floats) -> tuple[Ints, Ints, Floats]:
         """Vehicles (K,) in flights (K,) of which an edge slips, and the inverses of their equations."""
         each = np.concatenate([grip, np.ones((1, grip.shape[1]))])[self._rows]
         who, flight = np.nonzero((each < 1.0).any(axis=1))
@@ -200,7 +200,7 @@ class LinearFlight:
             integral += tick * (gap if grip is None else gap * (grip > 0.0))
             right = held[_INPUT] - own @ put - 2.0 * law.alpha * along - law.beta**2 * gap
             right -= law.gamma * integral
-            slipping = None if grip is None else self._slipping_ends(grip)
+            slipping = None if grip is None else self._slipping_inverses(grip)
             y, force, rest = np.zeros_like(right), 0.0, []
             for theirs in held[_REST:]:
                 y = self._multipliers(self._mean * (right + theirs) + self._damping * y, slipping)

@@ -10,7 +10,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import Mission
 from rigidfleet.planning.abort import Aborts
 from rigidfleet.planning.legs import Leg
-from rigidfleet.planning.losses import Answer, answer_to
+from rigidfleet.planning.losses import Answer, answer_to_loss
 from rigidfleet.planning.preview import (
     FEWEST_SAMPLES,
     PlannedPhase,
@@ -38,7 +38,7 @@ def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         text = f"{what} after the planned paths, at {first:g} s: what follows is not checked"
         yield Remark("note", "loss", text)
         return
-    way, problem, _ = planned_answer(mission, at, legs)
+    way, problem, _ = planned_answer_to_loss(mission, at, legs)
     end = way[-1].end
     does = "hold to" if mission.on_loss == "hold" or problem else "land by"
     stop = way[0].planned_end_state.r.mean(axis=0)
@@ -75,12 +75,12 @@ def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase]) -> Iterator[Rema
             yield Remark("fails", "loss", text)
 
 
-def planned_answer(mission: Mission, at: Leg, legs: Sequence[Leg]) -> Answer:
+def planned_answer_to_loss(mission: Mission, at: Leg, legs: Sequence[Leg]) -> Answer:
     """What follows the first loss, or an order to abort, in the leg ``at`` of the planned ones."""
     when = mission.abandons_at
     lost = mission.lost_at <= when
     now = copy_with(at.state_at(when), lost=lost if lost.any() else None)
-    return answer_to(mission, now, lambda: legs)
+    return answer_to_loss(mission, now, lambda: legs)
 
 
 def _lost_link_remarks(mission: Mission) -> Iterator[Remark]:

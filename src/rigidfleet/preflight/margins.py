@@ -15,7 +15,7 @@ from rigidfleet.math.margins import (
     LoopGains,
     Margins,
     formation_loops,
-    largest_pole,
+    largest_stable_pole,
     stability_margins,
     tracking_loops,
 )
@@ -51,8 +51,8 @@ def check_margins(
     for where, loops, law, growth in laws:
         known, pole = by_place.get(where, _UNBOUNDED)
         now = known.smaller_margins(stability_margins(loops, law, growth))
-        if constrained := [loop for loop in loops if loop.is_constrained]:
-            pole = largest_pole(constrained, law, pole, growth)
+        if constrained := [loop for loop in loops if loop.has_constraint_law]:
+            pole = largest_stable_pole(constrained, law, pole, growth)
         by_place[where] = FormationMargins(now, pole)
     alone = None if tracking is None else stability_margins(tracking.loops, tracking.law)
     return MarginsCheck(alone, by_place, skipped)
@@ -159,10 +159,10 @@ def margin_remarks(preflight: Preflight) -> Iterator[Remark]:
     if preflight.margins is None:
         return
     tracking, formations = preflight.margins.tracking, preflight.margins.formations
-    if tracking is not None and _is_small(tracking):
+    if tracking is not None and _has_small_margins(tracking):
         yield _margin_remark("tracking", tracking, "lower tracking.Q")
     # Where the tracking alone is unstable, no constraint law is to blame.
-    bad = {where: f for where, f in formations.items() if _is_small(f.margins)}
+    bad = {where: f for where, f in formations.items() if _has_small_margins(f.margins)}
     if bad and (tracking is None or tracking.stable):
         worst = min(bad.values(), key=lambda f: (f.margins.stable, f.margins.phase))
         if preflight.gains.stabilised:
@@ -176,7 +176,7 @@ def margin_remarks(preflight: Preflight) -> Iterator[Remark]:
         yield Remark("note", "margins", text)
 
 
-def _is_small(m: Margins) -> bool:
+def _has_small_margins(m: Margins) -> bool:
     return not m.stable or m.phase < _PHASE or m.gain[1] < _GAIN
 
 

@@ -119,16 +119,16 @@ def growth_at_delay(flight: LinearFlight, delay: int, accuracy: float = _FINE[0]
     size = flight.size + math.prod(messages)
     drift = np.zeros((size, 0))
 
-    def arrive(k: int, news: Callable[[int], Floats]) -> Floats | float:
+    def arriving_updates(k: int, news: Callable[[int], Floats]) -> Floats | float:
         return news(0) if (k - delay) % every == 0 else 0.0
 
     def later(z: Floats, ticks: int, grip: Floats | None = None) -> Floats:
         sent = z[flight.size :].reshape(*messages, -1).copy()
-        _, x = flight.fly(z[: flight.size], sent, ticks, delay, arrive, grip)
+        _, x = flight.fly(z[: flight.size], sent, ticks, delay, arriving_updates, grip)
         sent = np.roll(sent, -(ticks % delay), axis=0)
         return np.concatenate([x, sent.reshape(-1, x.shape[1])])
 
-    def period_later(z: Floats) -> Floats:
+    def state_after_period(z: Floats) -> Floats:
         z = later(z.reshape(-1, 1), ticks)[:, 0]
         return z - drift @ (drift.T @ z)  # motions of the whole formation are projected out
 
@@ -138,7 +138,7 @@ def growth_at_delay(flight: LinearFlight, delay: int, accuracy: float = _FINE[0]
         known = math.ceil((delay + every + flight.waits) / every) * every
         drift = np.linalg.qr(later(start, known, np.zeros((len(flight.links), x.shape[1]))))[0]
     # No class of its own: what scipy declares of this one is not how it is made.
-    operator: Any = LinearOperator((size, size), matvec=period_later, dtype=np.float64)  # ty: ignore[missing-argument, unknown-argument, parameter-already-assigned]
+    operator: Any = LinearOperator((size, size), matvec=state_after_period, dtype=np.float64)  # ty: ignore[missing-argument, unknown-argument, parameter-already-assigned]
     try:
         values = eigs(
             operator, 1, ncv=min(_VECTORS, size - 1), tol=accuracy, return_eigenvectors=False,
@@ -180,7 +180,7 @@ def mean_square_growth(
     spread = np.sqrt(kept * (1.0 - kept))
     block = np.arange(len(flight.links) * len(losses)).reshape(-1, len(losses), 1) * states
 
-    def arrive(k: int, news: Callable[[int], Floats]) -> Floats | float:
+    def arriving_updates(k: int, news: Callable[[int], Floats]) -> Floats | float:
         if (k - delay) % every:
             return 0.0
         change = news(0)
@@ -191,10 +191,10 @@ def mean_square_growth(
         sign = rng.integers(0, 2, (len(turn), len(kept))) * 2.0 - 1.0
         return kept * change + spread * sign * other.reshape(change.shape)
 
-    return _growth_flown(flight, delay, (len(losses), states), time, arrive)
+    return _simulated_growth(flight, delay, (len(losses), states), time, arriving_updates)
 
 
-def _growth_flown(
+def _simulated_growth(
     flight: LinearFlight,
     depth: int,
     shape: tuple[int, int],
@@ -237,7 +237,7 @@ def growth_in_network(flight: LinearFlight, net: Links, every: int) -> Floats:
     fading, grip = np.zeros((L, _FLIGHTS), dtype=np.bool_), np.ones((L, _FLIGHTS))
     due, newest = np.full((late + 1, L, _FLIGHTS), -1), np.zeros((L, _FLIGHTS), dtype=np.int64)
 
-    def arrive(k: int, news: Callable[[int], Floats]) -> Floats | float:
+    def arriving_updates(k: int, news: Callable[[int], Floats]) -> Floats | float:
         # The message sent at tick k - delay is due in some ticks from now, or never.
         total: Floats | float = 0.0
         due[(k - delay) % len(due)] = -1
@@ -256,7 +256,7 @@ def growth_in_network(flight: LinearFlight, net: Links, every: int) -> Floats:
         np.clip(grip + change, 0.0, 1.0, out=grip)
         return total
 
-    return _growth_flown(flight, delay + late, (_FLIGHTS, 1), _TIME, arrive, grip)
+    return _simulated_growth(flight, delay + late, (_FLIGHTS, 1), _TIME, arriving_updates, grip)
 
 
 def network_remarks(preflight: Preflight) -> Iterator[Remark]:

@@ -11,7 +11,7 @@ from rigidfleet._common.quantities import PLACES, QUANTITIES
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Box, Ground, Mission, Obstacle
 from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
-from rigidfleet.planning.clearance import CLOSE, closest, speed_bounds
+from rigidfleet.planning.clearance import CLOSE, clearance_to, speed_bounds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import SLACK, Preflight, Remark, names_in_words
 from rigidfleet.solids.records import swept_extent
@@ -53,7 +53,7 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             compared += planned.position[:, :, 0].size + _EACH
             if compared > _COMPARED:
                 break
-            clearance, agent, time, proved = closest(planned, thing, radius, paces[k])
+            clearance, agent, time, proved = clearance_to(planned, thing, radius, paces[k])
             if clearance - proved > max(unproved.get(b, 0.0), 1.5 * CLOSE):
                 unproved[b] = clearance - proved
             # Among equal minima, take the first one: ignore rounding and the last millimetre of a rest.
@@ -147,7 +147,7 @@ def _gap_remarks(mission: Mission, preflight: Preflight, radius: Floats) -> Iter
     A gap lies between the nearest boxes on both sides of the centre of mass along an axis.
     """
     masses = mission.fleet.mass
-    boxes = [t for t in mission.obstacles if isinstance(t, Box) and t.corners is not None]
+    boxes = [t for t in mission.obstacles if isinstance(t, Box) and t.box_bounds is not None]
     if len(boxes) < 2:
         return
     low, high = np.array([box.min for box in boxes]), np.array([box.max for box in boxes])

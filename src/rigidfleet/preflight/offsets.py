@@ -17,7 +17,7 @@ from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.math.margins import constraint_share_of_input
-from rigidfleet.math.pid import exponential
+from rigidfleet.math.pid import matrix_exponential
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.vehicles import air_force, jet_speeds
@@ -60,7 +60,7 @@ def slot_offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
             by_phase.append(pushed)
             continue
         flat = pushed.reshape(len(pushed), -1)
-        steps = exponential(laws, np.diff(planned.time[:2]))
+        steps = matrix_exponential(laws, np.diff(planned.time[:2]))
         answers = np.empty((len(flat), 2, flat.shape[1]))
         for k, push in enumerate(flat):
             answers[k] = now[:, 1]
@@ -121,7 +121,7 @@ def offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         far = float(np.linalg.norm(off, axis=2).max())
         if planned.leg.end > mission.first_loss or far < _LEAST:
             continue
-        broken = partial(_broken_limits, mission, preflight, planned)
+        broken = partial(_broken_limits_in_words, mission, preflight, planned)
         if not (now := broken(off)):
             continue
         own, surely = broken(0.0 * off), broken(max(0.0, _SURE - gusts / far) * off)
@@ -134,7 +134,7 @@ def offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     yield from remarks.values()
 
 
-def _broken_limits(
+def _broken_limits_in_words(
     mission: Mission, preflight: Preflight, planned: PlannedPhase, off: Floats
 ) -> dict[str, str]:
     """Topic and words of the limits that a planned phase breaks with offsets (K, N, 3) [m]."""
@@ -154,10 +154,10 @@ def _broken_limits(
             broken["collision"] = f"{least[2]} come {nearer:.2f} m nearer than the plan proves"
     arrival = min(int(np.searchsorted(planned.time, leg.arrival)), len(r) - 1)
     held = [("tracking error", "", float(far.max()), limits.tracking_error)]
-    # As `PhasePlan.target_record` and `PhasePlan.stay_target` promise.
-    stays, later = "position" not in phase.meets, arrival < len(r) - 1
+    # As `PhasePlan.target_record` and `PhasePlan.end_state_record` promise.
+    stays, later = "position" not in phase.commanded_at_arrival, arrival < len(r) - 1
     places = [("waypoint", arrival)] * (not stays)
-    places += [("its place at the end", -1)] * (stays or (later and not phase.free))
+    places += [("its place at the end", -1)] * (stays or (later and not phase.has_free_velocity))
     way = masses @ planned.position / masses.sum()
     for n, at in enumerate(phase.points, start=1):
         places.append(
@@ -167,8 +167,8 @@ def _broken_limits(
         by = float(np.linalg.norm(masses @ off[k]) / masses.sum())
         by = by if leg.planned_end_state.formation else max(by, float(far[k].max()))
         held.append(("waypoint", place, by, WAYPOINT_TOLERANCE["position"]))
-    forms, turns = phase.establishing is not None, "attitude" in phase.meets
-    lies, goal = forms and not mission.free_attitude(phase), leg.planned_end_state.goal
+    forms, turns = phase.establishing is not None, "attitude" in phase.commanded_at_arrival
+    lies, goal = forms and not mission.leaves_attitude_free(phase), leg.planned_end_state.goal
     kept = stays and not forms and goal is not None and goal.named
     for k in [arrival] * (lies or turns) + [-1] * (later if turns else kept):
         turn = rigid_body.kabsch(r[k], planned.position[k], masses, near=np.eye(3))

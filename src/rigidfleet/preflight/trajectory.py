@@ -16,7 +16,7 @@ from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
 from rigidfleet.mission import Mission
 from rigidfleet.mission.disturbances import gust_intensity
 from rigidfleet.planning import timing
-from rigidfleet.planning.certificate import of_blend
+from rigidfleet.planning.certificate import prove_blend
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.limits import limits_of
 from rigidfleet.planning.preview import PlannedPhase
@@ -46,14 +46,14 @@ def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         positions = planned.position if planned.path_ends is None else np.array(planned.path_ends)
         # Where separation begins at an altitude, agents below it are left to the verdict.
         flying = positions[..., 2] >= (-np.inf if lowest is None else lowest)
-        separations, pairs = proximity.separation_of_left(positions, radius, flying)
+        separations, pairs = proximity.separation_of_remaining(positions, radius, flying)
         for k in [int(separations.argmin())] if planned.path_ends is None else [0, -1]:
             ends.append((float(separations[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
         bent = len(planned.leg.reference.knots) and planned.path_ends is None and flying.all()
         if bent and (proved := planned.certificate) is not None:
             ends = [proved[:3]]
         if planned.path_ends is not None:
-            certificate = planned.certificate or of_blend(planned.leg.reference, radius)
+            certificate = planned.certificate or prove_blend(planned.leg.reference, radius)
             assert certificate is not None  # there are two agents
             crossing, separation = certificate[:3], certificate.separation
             least = min(least, crossing)
@@ -132,7 +132,7 @@ def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             yield Remark("fails" if exact else "note", "downwash", text)
 
 
-def _nearest_to_limit(
+def _force_nearest_to_limit(
     way: list[PlannedPhase], needs: list[Floats], limits: Floats
 ) -> tuple[float, float, str, float]:
     """Of the forces (K, N) [N] of each phase, the one nearest to its limit (N,) [N], or the greatest if there is none.
@@ -145,7 +145,7 @@ def _nearest_to_limit(
     return float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])
 
 
-def greatest_thrust(
+def thrust_nearest_to_limit(
     mission: Mission, way: list[PlannedPhase]
 ) -> tuple[float, float, str, float] | None:
     """The planned thrust [N] that is nearest to its limit, its time [s], agent and limit [N]; None without a plan."""
@@ -153,7 +153,7 @@ def greatest_thrust(
         return None
     mass, weight = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
     needs = [mass * np.linalg.norm(planned.acceleration + weight, axis=2) for planned in way]
-    return _nearest_to_limit(way, needs, mission.fleet.thrust_limit)
+    return _force_nearest_to_limit(way, needs, mission.fleet.thrust_limit)
 
 
 def greatest_speed(way: list[PlannedPhase], axes: slice) -> tuple[float, float, str] | None:
@@ -161,7 +161,7 @@ def greatest_speed(way: list[PlannedPhase], axes: slice) -> tuple[float, float, 
     if not way:
         return None
     sizes = [np.linalg.norm(planned.velocity[..., axes], axis=2) for planned in way]
-    return _nearest_to_limit(way, sizes, np.full(sizes[0].shape[1], np.inf))[:3]
+    return _force_nearest_to_limit(way, sizes, np.full(sizes[0].shape[1], np.inf))[:3]
 
 
 def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -183,7 +183,7 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
         force = true[:, None] * (planned.acceleration + g * up)
         force -= drag[:, None] * (wind - planned.velocity)
         needs.append(np.linalg.norm(force, axis=2) + gusts + noise)
-    most = _nearest_to_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
+    most = _force_nearest_to_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
     steady = air_force(mission, np.tile(wind, (len(drag), 1)))
     steady -= ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
@@ -203,7 +203,7 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
         yield Remark("note", "disturbances", text)
 
 
-def step_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
+def reference_step_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on the forces at a step of the reference: J M^-1 J^T lambda = -beta^2 c."""
     c, masses = mission.constraint, mission.fleet.mass
     if c.stabilisation == "none":
@@ -245,10 +245,10 @@ def waypoint_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
         if phase.control == "open" or goal is None or leg.arrival > leg.end:
             continue
         pose = pose_at(leg.motion, leg.arrival)
-        stays = phase.control == "tracking" and "position" not in phase.meets
+        stays = phase.control == "tracking" and "position" not in phase.commanded_at_arrival
         ways = ("position", pose.r, goal.r), ("velocity", pose.v, goal.v)
-        meets = {x: math.dist(a, b) for x, a, b in ways if stays or x in phase.meets}
-        if "attitude" in phase.meets and mission.n_agents > 1:
+        meets = {x: math.dist(a, b) for x, a, b in ways if stays or x in phase.commanded_at_arrival}
+        if "attitude" in phase.commanded_at_arrival and mission.n_agents > 1:
             turn = att.rotation_vector_from_dcm(pose.T @ goal.T.T)
             # As flown: agents on a line do not show how it spins.
             state = slot_derivatives(leg.reference, leg.motion, np.array([leg.arrival]), 2)[0]

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from rigidfleet._common.text import percent
+from rigidfleet._common.text import percent_text
 from rigidfleet.math import series
 from rigidfleet.math.quadrotor import Flat, flat, mixing
 from rigidfleet.mission import Mission
@@ -133,8 +133,8 @@ def vehicle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         share, who, phase, need = preflight.vehicles.beyond
         fails = share > mission.limits.saturation and phase in exact
         text = (
-            f"{who} cannot give what the plan asks of it for {percent(share)} of phase '{phase}', which needs {need};"
-            " give the phase more time, the vehicle less mass, or another yaw"
+            f"{who} cannot give what the plan asks of it for {percent_text(share)} of phase '{phase}', which needs"
+            f" {need}; give the phase more time, the vehicle less mass, or another yaw"
         )
         yield Remark("fails" if fails else "note", "rotors", text)
     jump = preflight.vehicles.jump

@@ -40,7 +40,7 @@ def brief_rows(
         ("Aborted", abort or ["No way home belongs to this report."]),
         ("Fences and people", beside or ["The mission has neither."]),
         ("Where things fall", _fall_sentences(result, falls)),
-        ("Versions and digests", digest_sentences(result)),
+        ("Versions and digests", provenance_sentences(result)),
     ]
 
 
@@ -100,7 +100,7 @@ def _fall_sentences(result: Result, falls: Floats) -> list[str]:
     ]
 
 
-def digest_sentences(result: Result) -> list[str]:
+def provenance_sentences(result: Result) -> list[str]:
     """Versions, what the flight took to compute, and digests of its mission, of files and of what was flown."""
     versions = ", ".join(f"{name} {version}" for name, version in result.versions.items())
     states = sha256(np.ascontiguousarray(result.position).tobytes()).hexdigest()
@@ -111,5 +111,5 @@ def digest_sentences(result: Result) -> list[str]:
         f"{versions}, on {result.platform}; made {result.created[:19].replace('T', ' ')} UTC{steps}.",
         f"Mission file, SHA-256 {result.mission.digest}",
         f"Positions flown, SHA-256 {states}",
-        *result.mission.about.replace("# ", "").splitlines(),
+        *result.mission.file_digests_text.replace("# ", "").splitlines(),
     ]

@@ -76,12 +76,12 @@ def page_contents(
         "several": several,
         "flights": pages,
         **first,
-        "figures": [] if several else [_figure(flights[0], name) for name in drawn],
+        "figures": [] if several else [_figure_for_page(flights[0], name) for name in drawn],
         "passed": all(verdict.passed for verdict in judged),
         "safety": _safety_table(flights, judged, names),
-        "numbers": _numbers_table(flights, judged, names) if several else None,
-        "keys": _keys_table(missions, names) if several else None,
-        "overlays": _overlays(flights, names) if several else [],
+        "numbers": _number_comparison_table(flights, judged, names) if several else None,
+        "keys": _differing_keys_table(missions, names) if several else None,
+        "overlays": _overlay_pictures(flights, names) if several else [],
         "controlled": controlled,
         "version": __version__,
         "covers": _scope_in_words(flights),
@@ -103,7 +103,7 @@ def _names_of(flights: Sequence[Result]) -> list[str]:
 def _flight_data(result: Result, verdict: Verdict, label: str, colour: str) -> dict[str, Any]:
     mission = result.mission
     judged = [check for check in verdict.checks if check.judged]
-    failed = verdict.failures or verdict.open_checks
+    failed = verdict.failures or verdict.undecided_checks
     return {
         "label": label,
         "head_cell": Cell(label, colour=colour),
@@ -115,7 +115,7 @@ def _flight_data(result: Result, verdict: Verdict, label: str, colour: str) -> d
         "head": f"{len(failed)} of {len(judged)} checks {verdict.word}"
         if failed
         else all_hold_in_words(len(judged)),
-        "words": [f.message for f in (*verdict.failures, *verdict.open_checks)]
+        "words": [f.message for f in (*verdict.failures, *verdict.undecided_checks)]
         or [verdict.summary.split("\n")[0].partition("; ")[2] or verdict.covers],
         "notes": [verdict.uncalled, *verdict.notes] if verdict.uncalled else verdict.notes,
         "plan": brief.plan_sentences(result),
@@ -123,9 +123,9 @@ def _flight_data(result: Result, verdict: Verdict, label: str, colour: str) -> d
         "checks": [part for part in verdict.facts().shown_parts if isinstance(part, FactTable)],
         "vehicles": _vehicles_table(result),
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
-        "summary": _figure(result, "summary"),
+        "summary": _figure_for_page(result, "summary"),
         "gains": _gains_table(result),
-        "digests": brief.digest_sentences(result),
+        "digests": brief.provenance_sentences(result),
         "text": result.mission_text,
     }
 
@@ -226,14 +226,14 @@ def _safety_level(row: Safety) -> Level:
     return "" if row.limit is None else "ok" if row.passed else "fails"
 
 
-def _words_for_nothing(name: str) -> str:
+def _nothing_to_measure_text(name: str) -> str:
     return quantity(name.replace(" ", "_")).nothing or "nothing to measure"
 
 
 def _safety_cells(row: Safety) -> tuple[str | Cell, ...]:
     """Limit, worst value, margin, when and who."""
     if (worst := row.worst) is None:
-        return row.fact.bound, _words_for_nothing(row.quantity), "", "", ""
+        return row.fact.bound, _nothing_to_measure_text(row.quantity), "", "", ""
     left = ""
     if row.margin is not None:
         left = f"{value(abs(row.margin), row.unit)} {'left' if row.margin >= 0 else 'beyond'}"
@@ -246,7 +246,7 @@ def _safety_cells(row: Safety) -> tuple[str | Cell, ...]:
 def _safety_cell(name: str, row: Safety | None) -> Cell:
     """The worst value of one of several flights, with its limit, whom and when."""
     if row is None:
-        return Cell(_words_for_nothing(name))
+        return Cell(_nothing_to_measure_text(name))
     limit, worst, _, when, who = _safety_cells(row)
     small = ", ".join(str(x) for x in (limit, who, getattr(when, "text", "")) if x)
     return Cell(str(worst), small, level=_safety_level(row))
@@ -255,7 +255,7 @@ def _safety_cell(name: str, row: Safety | None) -> Cell:
 # -- what differs ------------------------------------------------------------------------------------
 
 
-def _numbers_table(
+def _number_comparison_table(
     flights: Sequence[Result], verdicts: Sequence[Verdict], labels: Sequence[str]
 ) -> FactTable:
     """Numbers of the flights side by side, with how much they differ from those of the first."""
@@ -301,9 +301,9 @@ def _change(first: float | None, x: float | None) -> str:
     return f"{percent:+.0f} %".replace("-", "−") if abs(percent) >= 0.5 else ""
 
 
-def _keys_table(missions: Sequence[Mission], labels: Sequence[str]) -> FactTable:
+def _differing_keys_table(missions: Sequence[Mission], labels: Sequence[str]) -> FactTable:
     """Keys of the mission files that differ between missions."""
-    flat = [dict(_flat_keys(mission.to_dict())) for mission in missions]
+    flat = [dict(_key_paths_and_values(mission.to_dict())) for mission in missions]
     rows = []
     for key in dict.fromkeys(key for one in flat for key in one):
         values = [one.get(key, "not set") for one in flat]
@@ -315,14 +315,14 @@ def _keys_table(missions: Sequence[Mission], labels: Sequence[str]) -> FactTable
     return FactTable(("key", *labels), rows, labels)
 
 
-def _flat_keys(data: Any, key: str = "") -> Iterator[tuple[str, str]]:
+def _key_paths_and_values(data: Any, key: str = "") -> Iterator[tuple[str, str]]:
     """Keys in the notation of messages (phases[2].until), and their values as text."""
     if isinstance(data, Mapping):
         for name, item in data.items():
-            yield from _flat_keys(item, f"{key}.{name}" if key else str(name))
+            yield from _key_paths_and_values(item, f"{key}.{name}" if key else str(name))
     elif isinstance(data, list) and data and all(isinstance(item, Mapping) for item in data):
         for number, item in enumerate(data, start=1):
-            yield from _flat_keys(item, f"{key}[{number}]")
+            yield from _key_paths_and_values(item, f"{key}[{number}]")
     else:
         yield key, str(data)
 
@@ -330,7 +330,7 @@ def _flat_keys(data: Any, key: str = "") -> Iterator[tuple[str, str]]:
 # -- figures -----------------------------------------------------------------------------------------
 
 
-def _figure(result: Result, name: str) -> dict[str, str]:
+def _figure_for_page(result: Result, name: str) -> dict[str, str]:
     svg = plotting.render_figure(result, name, ["svg"])["svg"]
     pairs = name == "constraint_error" and not len(result.edges)
     return _picture(name, svg, "Shape error of all pairs." if pairs else plotting.caption(name))
@@ -346,8 +346,8 @@ def _data_url(svg: bytes) -> str:
     return f"data:image/svg+xml;base64,{b64encode(svg).decode()}"
 
 
-def _overlays(flights: Sequence[Result], labels: Sequence[str]) -> list[dict[str, str]]:
+def _overlay_pictures(flights: Sequence[Result], labels: Sequence[str]) -> list[dict[str, str]]:
     return [
-        _picture("paths", overlay.draw_paths(flights, labels), "Paths of the formations' centres of mass."),
-        _picture("over time", overlay.draw_over_time(flights, labels), "Worst value of all vehicles at each time."),
+        _picture("paths", overlay.svg_of_paths(flights, labels), "Paths of the formations' centres of mass."),
+        _picture("over time", overlay.svg_of_time_curves(flights, labels), "Worst value of all vehicles at each time."),
     ]  # fmt: skip

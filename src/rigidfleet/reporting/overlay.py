@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _WIDTHS = (2.6, 0.9)  # of lines, first flight to last: each remains visible under the next
 
 
-def draw_paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
+def svg_of_paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
     """Path of the centre of mass from above, and its height over time, as an SVG."""
     with st.apply_style():
         fig = st.blank_figure(st.WIDTH, 3.6, "constrained")
@@ -36,7 +36,7 @@ def draw_paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
         return _svg_of_figure(fig)
 
 
-def draw_over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
+def svg_of_time_curves(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
     """Distances, thrust, speed and errors over time, as an SVG."""
     panels = ["separation", "thrust", "speed", "tracking_error", "constraint"]
     if any(flight.mission.obstacles for flight in flights):

@@ -26,7 +26,7 @@ class Fade(NamedTuple):
     colours: tuple[str, ...]
 
 
-def fades(result: Result) -> list[Fade]:
+def light_fades(result: Result) -> list[Fade]:
     """Changes of light: vehicles fade to the colours of a formation as they take it.
 
     The first is the light at the start, at once. A formation without a colour keeps the light before.
@@ -52,12 +52,12 @@ def fades(result: Result) -> list[Fade]:
 
 def has_lights(result: Result) -> bool:
     """Whether a formation that was flown has colours."""
-    return len(fades(result)) > 1
+    return len(light_fades(result)) > 1
 
 
-def lights(result: Result, time: Floats) -> Floats:
+def light_colours(result: Result, time: Floats) -> Floats:
     """Red, green and blue (K, N, 3), from 0 to 1, of each vehicle's light at times (K,) [s]."""
-    changes = fades(result)
+    changes = light_fades(result)
     shown = np.array([rgb(change.colours) for change in changes])
     begin, end = np.array([change[:2] for change in changes]).T
     k = np.clip(np.searchsorted(begin, time, side="right") - 1, 0, None)
@@ -71,7 +71,7 @@ def rgb(colours: tuple[str, ...]) -> Floats:
     return np.array([[*bytes.fromhex(colour[1:])] for colour in colours]) / 255.0
 
 
-def view_angles(result: Result) -> tuple[float, float]:
+def angles_facing_formation(result: Result) -> tuple[float, float]:
     """Azimuth and elevation [rad] of a viewer, from the flight, who reads the flattest of the lit formations."""
     best, seen = np.inf, plane_view(np.zeros((1, 3)))
     for phase in range(len(result.phases)):

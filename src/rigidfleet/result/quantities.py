@@ -84,7 +84,7 @@ def samples(result: Result, name: str, close: proximity.Closeness | None = None)
     return Samples(QUANTITIES[name], *SAMPLED[name](result))
 
 
-def _motion_sizes(result: Result, q: Quantity) -> tuple[Floats, ...]:
+def _motion_magnitudes(result: Result, q: Quantity) -> tuple[Floats, ...]:
     """Sizes (K, N) of velocity, acceleration or the jerk of slots, in all directions or one."""
     x = getattr(result, ("velocity", "acceleration", "slot_jerk")[q.order - 1])
     if x is None:
@@ -92,7 +92,7 @@ def _motion_sizes(result: Result, q: Quantity) -> tuple[Floats, ...]:
     return (mask_lost(result, SIZES[q.way](x) if q.way else norms(x)),)
 
 
-def _headroom(result: Result) -> tuple[Floats, Owner]:
+def _separation_below(result: Result) -> tuple[Floats, Owner]:
     """Least height (K,) [m] between two agents, one below the other."""
     least, pair = proximity.headroom(result.position, result.mission.agents.radius, result.left)
     return least, lambda k: pair[k]
@@ -114,7 +114,7 @@ def _distance_to_lost(result: Result) -> tuple[Floats, Owner]:
     return least, lambda k: who[k]
 
 
-def _beyond_fence(result: Result) -> tuple[Floats, ...]:
+def _distance_beyond_fence(result: Result) -> tuple[Floats, ...]:
     """Greatest distance (K, N) [m] of an agent's centre outside the geofence; negative inside."""
     r, fence = result.position, result.mission.limits.geofence
     if fence is None:
@@ -161,10 +161,10 @@ def _with_edge_owners(result: Result, values: Floats) -> tuple[Floats, Owner]:
 
 #: Values of quantities at samples, with their owners where these are no single agents.
 SAMPLED: dict[str, Callable[[Result], tuple[Any, ...]]] = {
-    **{q.name: partial(_motion_sizes, q=q) for q in MOTIONS},
-    "separation_below": _headroom,
+    **{q.name: partial(_motion_magnitudes, q=q) for q in MOTIONS},
+    "separation_below": _separation_below,
     "lost": _distance_to_lost,
-    "geofence": _beyond_fence,
+    "geofence": _distance_beyond_fence,
     **{name: partial(_boundary_distances, name=name) for name in ("fence", "soft_fence", "people")},
     **dict.fromkeys(("lowest", "highest"), lambda r: (mask_lost(r, r.position[..., 2]),)),
     "thrust": _thrust,

@@ -19,6 +19,7 @@ from rigidfleet._common.arguments import as_path
 from rigidfleet._common.facts import Fact, FactTable, Row, Sheet, Shown, table_of_worst_values
 from rigidfleet._common.files import write_file
 from rigidfleet._common.quantities import PLACES, quantity
+from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet.errors import MissionError, ResultError, wrong_type
 from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, netcdf_content, read_netcdf
 from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
@@ -51,6 +52,7 @@ def _installed_versions() -> dict[str, str]:
     return versions
 
 
+@with_earlier_names(evaluate="compute_lazy_values", motion="setpoints_at_samples")
 @dataclass(kw_only=True, eq=False, repr=False)
 class Result(Shown):
     """Record of a flight: the states of all vehicles, the forces on them, and the mission.
@@ -316,7 +318,7 @@ class Result(Shown):
         self._later = {key: other for key, other in self._later.items() if key not in made}
         return self.__dict__[name]
 
-    def evaluate(self) -> Result:
+    def compute_lazy_values(self) -> Result:
         """Compute now what is computed when it is first asked for, as before a copy goes elsewhere; return itself."""
         for name in [*self._later]:
             getattr(self, name)
@@ -385,13 +387,13 @@ class Result(Shown):
                 f"the mission in the result cannot be read (written by rigidfleet {made}):\n{error}"
             )
             raise ResultError(message) from error
-        if wrong := self._contradiction(mission):
+        if wrong := self._contradiction_in_words(mission):
             raise ResultError(
                 f"the mission in the result belongs to another flight: {wrong}. Fly it again or use another copy."
             )
         return mission
 
-    def _contradiction(self, mission: Mission) -> str:
+    def _contradiction_in_words(self, mission: Mission) -> str:
         """Describe how the arrays contradict a mission; "" if they agree."""
         from rigidfleet.mission import KINDS
 
@@ -522,9 +524,9 @@ class Result(Shown):
         ValueError
             The rate is not positive, or gives too many setpoints.
         """
-        return setpoints_at_rate(self.motion(flown=flown), rate)
+        return setpoints_at_rate(self.setpoints_at_samples(flown=flown), rate)
 
-    def motion(self, *, flown: bool = False) -> Setpoints:
+    def setpoints_at_samples(self, *, flown: bool = False) -> Setpoints:
         """The setpoints of every sample, of which there are two at a change of phase; see `setpoints`."""
         references = self.slot_position, self.slot_velocity, self.slot_acceleration, self.slot_jerk
         nothing = np.full(self.position.shape, np.nan)

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.rigidity.framework import Flex, Framework, localised_flexes
-from rigidfleet.rigidity.order import StressEnergy, blocking_stress, finite_flex
+from rigidfleet.rigidity.order import StressEnergy, blocking_stress, deform_by_finite_flex
 from rigidfleet.typing import Floats, Ints
 
 
@@ -31,6 +32,7 @@ _BARELY = 1e-3
 WHERE = ("point", "line", "plane", "space")
 
 
+@with_earlier_names(force="constraint_force_bound")
 @dataclass(frozen=True)
 class Rigidity:
     """Rigidity of a shape under the distances of some edges, and the motions they leave free.
@@ -87,7 +89,7 @@ class Rigidity:
         flexible = self.rigidity_class is RigidityClass.FLEXIBLE
         return self.within if flexible and self.within is not None else self
 
-    def force(self, b: float, mass: float = 1.0) -> float:
+    def constraint_force_bound(self, b: float, mass: float = 1.0) -> float:
         """Greatest norm of f_C (all agents) [N] under the exact law for a right side of norm `b` [m/s^2].
 
         |f_C| <= m |b| / index for equal masses: a shape of half the index may need twice the force.
@@ -171,7 +173,7 @@ def analyse(
         reachable=full_rank(n, d),
         needed=full_rank(n, space),
         redundant=frame.redundant_edges(),
-        spare=frame.spare_edges(),
+        spare=frame.jointly_removable_edges(),
         flexes=flexes,
         index=_rigidity_index(frame, masses),
         rigidity_class=rigidity_class,
@@ -271,7 +273,7 @@ def classify_rigidity(
     if stress is not None:
         reason = f"{free} to first order; a self-stress blocks all of them"
         return RigidityClass.PRESTRESS_STABLE, reason, stress, None
-    bent, goes_on = finite_flex(StressEnergy(frame, frame.flexes @ open_flexes))
+    bent, goes_on = deform_by_finite_flex(StressEnergy(frame, frame.flexes @ open_flexes))
     if bent is not None:
         reason = "a finite motion that keeps all distances was found and followed"
         return RigidityClass.FLEXIBLE, reason, None, bent

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet._common.arguments import as_numbers
+from rigidfleet._common.renamed import getattr_of_earlier_names
 from rigidfleet.errors import wrong_type
 from rigidfleet.formation.distance_geometry import dimension, distances
 from rigidfleet.formation.graphs import complete_graph
@@ -87,13 +88,13 @@ def design(
     rank = full_rank(n, d)
     if rank == 0:
         return near if extra == "complete" else near[:0]
-    rows = _rows_of_jacobian(flat, edges)
+    rows = _nonrigid_jacobian_rows(flat, edges)
     _assert_reach_holds_shape(rows, length, reach, rank)
     wanted = len(near) if extra == "complete" else rank + extra
     if wanted >= len(near):
         return near
     rows = rows[length <= reach]
-    meshes = [np.arange(len(near)), *_edges_of_meshes(flat, near)]
+    meshes = [np.arange(len(near)), *_delaunay_and_hull_edges(flat, near)]
     starts = [_add_rows(rows, _remove_rows(rows, some, wanted), wanted) for some in meshes]
     chosen = max(starts, key=lambda some: _least_eigenvalue(rows[some]))
     rng = np.random.default_rng(seed)
@@ -111,7 +112,7 @@ def design(
         chosen = _perturb(rows, best, rng)
 
 
-def limits(slots: ArrayLike) -> str:
+def free_motions_text(slots: ArrayLike) -> str:
     """Motions of a flat or straight shape that distances cannot prevent, in words; "" for a spatial shape."""
     n, d = len(np.asarray(slots)), dimension(slots)
     if d == 3 or n <= d + 1:
@@ -142,7 +143,7 @@ def mission_fragment(
     return to_toml({"formations": {name: {"slots": points, "edges": pairs, "reach": reach}}})
 
 
-def _rows_of_jacobian(flat: Floats, edges: Ints) -> Floats:
+def _nonrigid_jacobian_rows(flat: Floats, edges: Ints) -> Floats:
     """Rows of J (m, r) in coordinates of the non-rigid motions."""
     n, d = flat.shape
     rigid = rigid_motions(flat)
@@ -176,7 +177,7 @@ def _assert_reach_holds_shape(rows: Floats, length: Floats, reach: float, rank: 
     )
 
 
-def _edges_of_meshes(flat: Floats, near: Ints) -> list[Ints]:
+def _delaunay_and_hull_edges(flat: Floats, near: Ints) -> list[Ints]:
     """The edges, as indices into `near`, of Delaunay's triangulation and of the convex hull of points (N, d)."""
     from scipy.spatial import ConvexHull, Delaunay, QhullError
 
@@ -292,3 +293,6 @@ def _perturb(rows: Floats, chosen: Ints, rng: np.random.Generator) -> Ints:
         else:
             gone += 1
     return some[keep] if gone == add else chosen
+
+
+__getattr__ = getattr_of_earlier_names(__name__, limits="free_motions_text")

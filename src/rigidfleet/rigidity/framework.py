@@ -90,7 +90,7 @@ class Framework:
         """Edges of which any single one could be removed without loss of rank: those that some self-stress loads."""
         return np.flatnonzero(1 - (self.span**2).sum(axis=1) > ZERO)
 
-    def spare_edges(self) -> Ints:
+    def jointly_removable_edges(self) -> Ints:
         """Edges that could all be removed at once without loss of rank, long ones first."""
         if self.stress_dimension == 0:
             return np.zeros(0, dtype=np.int64)
@@ -205,7 +205,7 @@ def sparse_flexes(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) ->
     motions = []
     for i in seeds[:: max(1, -(-len(seeds) // most))]:
         for way in _basis_near_axes(part[i][:, strength[i] > (1.0 - _ALIKE) * strength[i, 0]]):
-            motions.append(_put_to_rest(_motion_of_least_speed(way @ blocks[i], V, n), V))
+            motions.append(_stop_slow_agents(_motion_of_least_speed(way @ blocks[i], V, n), V))
     return motions
 
 
@@ -232,7 +232,7 @@ def _basis_near_axes(U: Floats) -> list[Floats]:
     return basis
 
 
-def _put_to_rest(motion: Floats, V: Floats) -> Floats:
+def _stop_slow_agents(motion: Floats, V: Floats) -> Floats:
     """The nearest motion in the span of V in which nearly resting agents are at rest."""
     n = len(motion)
     speed = np.linalg.norm(motion, axis=1)

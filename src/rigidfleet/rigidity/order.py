@@ -118,7 +118,7 @@ def _search_blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats
     unit = np.eye(energy.k)
     blocking: list[Floats] = []
 
-    def lack(z: Floats) -> tuple[float, Floats]:
+    def shortfall_and_gradient(z: Floats) -> tuple[float, Floats]:
         force = energy.nearest_stress(z)
         value, vector = np.linalg.eigh(unit - energy.energy_matrix(force))
         if value[-1] < 0.9 and 1 - value[-1] > _DEFINITE * (1 - value[0]):
@@ -133,7 +133,7 @@ def _search_blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats
         start *= energy.k / size  # then the trace of E is that of 1
     options = {"maxiter": 300, "maxfun": 300, "ftol": 1e-14, "gtol": 1e-9}
     try:
-        best = minimize(lack, start, jac=True, method="L-BFGS-B", options=options)
+        best = minimize(shortfall_and_gradient, start, jac=True, method="L-BFGS-B", options=options)
     except StopIteration:
         return blocking[-1] / np.abs(blocking[-1]).max(), unit[:, :0], False
     value, vector = np.linalg.eigh(unit - energy.energy_matrix(energy.nearest_stress(best.x)))
@@ -142,7 +142,7 @@ def _search_blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats
     return None, vector[:, value > 1e-3], proven
 
 
-def finite_flex(energy: StressEnergy) -> tuple[Floats | None, bool]:
+def deform_by_finite_flex(energy: StressEnergy) -> tuple[Floats | None, bool]:
     """The framework (N, d) deformed by a finite motion that keeps all lengths; None if none is found.
 
     Flexes that extend to second order are searched near those that move few agents and near random ones. Each is
@@ -252,7 +252,7 @@ def _length_errors(p: Floats, i: Ints, j: Ints, length: Floats) -> Floats:
     return (((p[:, i] - p[:, j]) ** 2).sum(axis=2) - length**2) / (2 * length)
 
 
-def are_joined(frame: Framework, goal: Floats, strides: int) -> bool:
+def can_deform_into(frame: Framework, goal: Floats, strides: int) -> bool:
     """Whether shapes with the same lengths lead from a framework to another one, (N, d), in small steps.
 
     The walk goes towards the other shape as far as the flexes let it. Where it would turn back, it goes on: a

@@ -17,7 +17,7 @@ from rigidfleet.rigidity.analysis import (
     flatten_points,
 )
 from rigidfleet.rigidity.framework import Framework
-from rigidfleet.rigidity.order import STRIDES, align_points, are_joined, descend_to_lengths
+from rigidfleet.rigidity.order import STRIDES, align_points, can_deform_into, descend_to_lengths
 from rigidfleet.typing import Floats, Ints
 
 #: Shapes whose all-pairs distances differ by less than this share of their size count as equal.
@@ -164,9 +164,9 @@ def realisations(
         if at.shape != (n, 3) or not np.isfinite(at).all():
             raise ValueError(f"start must be ({n}, 3) finite positions [m], not {at.shape}")
         begin = align_points(at, drawn) @ axes[:dimension].T
-        end = follow_lengths(begin, e, length, _REACHED * size)
+        end = deform_to_lengths(begin, e, length, _REACHED * size)
     last = None if end is None else groups.add(end, 0)
-    first = groups.families(e)
+    first = groups.flex_families(e)
     counts = np.bincount(first, groups.counts).astype(int).tolist()
     shapes = {k: _realisation(groups.shapes[k], p, e, counts[k], size, axes) for k in set(first)}
     rank = {Kind.SAME: 0, Kind.MIRRORED: 1}
@@ -197,7 +197,7 @@ class _Groups:
         self.counts.append(count)
         return len(self.shapes) - 1
 
-    def families(self, e: Ints) -> list[int]:
+    def flex_families(self, e: Ints) -> list[int]:
         """Of each shape, the first one into which it bends while the edges (m, 2) keep their lengths; or itself."""
         frames = [Framework(q, e) for q in self.shapes]
         bend = [k for k, frame in enumerate(frames) if frame.flexes.size]
@@ -208,7 +208,7 @@ class _Groups:
                 for j in sorted(bend, key=lambda j: np.abs(self._pairs[j] - self._pairs[k]).max()):
                     nearest.setdefault(first[j], j)
                 for family, j in nearest.items():
-                    if family < k and are_joined(frames[k], frames[j].p, strides):
+                    if family < k and can_deform_into(frames[k], frames[j].p, strides):
                         first = [family if i == k else i for i in first]
                         break
         return first
@@ -239,7 +239,7 @@ def _distances_of_pairs(p: Floats) -> Floats:
     return np.linalg.norm(p[i] - p[j], axis=1)
 
 
-def follow_lengths(
+def deform_to_lengths(
     start: Floats, e: Ints, length: Floats, tol: float, slots: Floats | None = None
 ) -> Floats | None:
     """Positions (N, d) to which lengths (m,) lead that go from those at the start to the desired ones in small steps.

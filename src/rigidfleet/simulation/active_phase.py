@@ -125,7 +125,7 @@ class ActivePhase:
     def drop_command(self) -> None:
         """Drop the last command of vehicles."""
 
-    def release(self) -> None:
+    def free_memory(self) -> None:
         """Give back what the phase holds, after the end: nothing more is asked of it."""
 
     # -- where it is ----------------------------------------------------------------------------------
@@ -210,7 +210,7 @@ class ActivePhase:
             quiet = self.t - self.lateness >= least and self._largest_error() <= settle.tolerance
             self.quiet_since = min(self.quiet_since, self.t) if quiet else math.inf
 
-    def continue_by_hand(self, problem: Problem) -> None:
+    def switch_problem_by_hand(self, problem: Problem) -> None:
         """Continue with another problem of the same size, such as one with a different reference, by hand."""
         self.plan.problem = problem
         self.counted[records.EVALUATIONS] += self.state.count[records.EVALUATIONS]

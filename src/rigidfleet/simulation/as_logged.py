@@ -15,7 +15,7 @@ import numpy as np
 
 from rigidfleet.assessment import Verdict, assess
 from rigidfleet.assessment.alignment import Alignment, fit_alignment
-from rigidfleet.assessment.doubt import DrawnWays, doubt_facts, verdict_with_doubt
+from rigidfleet.assessment.doubt import DrawnWays, uncertainty_facts, verdict_with_intervals
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign.curves import ASSUMED, Trajectories
 from rigidfleet.math import smoothing
@@ -87,8 +87,8 @@ def judge_log(
         doubts = doubts._replace(clock="own")
     flown, drawn, estimate, alignment = _likely_flight(read, plan, doubts, judged)
     deviations = None if drawn is None else DrawnWays(flown, drawn)
-    facts = doubt_facts(flown, deviations, estimate, alignment, doubts.clock)
-    verdict = verdict_with_doubt(assess(flown), deviations, facts, shared=doubts.clock != "own")
+    facts = uncertainty_facts(flown, deviations, estimate, alignment, doubts.clock)
+    verdict = verdict_with_intervals(assess(flown), deviations, facts, shared=doubts.clock != "own")
     flown.statistics["doubt"] = facts
     return flown, verdict
 
@@ -183,7 +183,7 @@ def _smooth_ways(logs: Sequence[Positions], noise: PositionNoise) -> list[Smooth
 
 def _planned_ways(plan: Result) -> Piecewise:
     """The plan: ways of slots, and of vehicles as they fly in the simulator where no slots are tracked."""
-    slots, flown = plan.motion(), plan.motion(flown=True)
+    slots, flown = plan.setpoints_at_samples(), plan.setpoints_at_samples(flown=True)
     state = np.where(np.isnan(slots.state), flown.state, slots.state)
     state[:, 2:] = np.nan_to_num(state[:, 2:])  # of straight lines
     still = np.zeros_like(slots.yaw)
@@ -255,7 +255,7 @@ def flight_of_plan(plan: Result, planned: Piecewise, way: Piecewise, spans: list
             extremes = watch.end_phase() | fastest
         records.append(replace(record, extremes=extremes, settled=None, controller=None))
     watch.keep_only(np.ones(plan.n_agents, dtype=np.bool_))
-    watch.complete_phases(records)
+    watch.add_flight_extremes(records)
     every = {name: getattr(plan, name) for name in _PLANNED}
     known: dict[str, Any] = {name: x[inside] for name, x in every.items() if x is not None}
     (r, v, a), slots = way.states(time, 3), planned.states(time, 3)[..., :3]

@@ -101,7 +101,7 @@ def article_and_kind(command: Command) -> str:
     return f"{'an' if isinstance(command, AttitudeCommand) else 'a'} {type(command).__name__}"
 
 
-def finite_numbers(x: ArrayLike, shape: tuple[int, ...]) -> Floats:
+def copy_finite_array(x: ArrayLike, shape: tuple[int, ...]) -> Floats:
     """A copy of finite numbers of a shape, as a user's function gives them.
 
     Raises
@@ -132,7 +132,7 @@ def check_command(command: Command, n: int, t: float) -> dict[str, Floats]:
     arrays = {}
     for name, value in vars(command).items():
         try:
-            arrays[name] = finite_numbers(
+            arrays[name] = copy_finite_array(
                 np.zeros(rows[name]) if value is None else value, rows[name]
             )
         except ValueError as error:
@@ -151,7 +151,7 @@ def check_command(command: Command, n: int, t: float) -> dict[str, Floats]:
 def check_force(f: ArrayLike, n: int, who: str, t: float) -> Floats:
     """Forces (N, 3) [N] from a user's function, checked; an error says what it returned instead."""
     try:
-        return finite_numbers(f, (n, 3))
+        return copy_finite_array(f, (n, 3))
     except ValueError as error:
         raise FlightError(
             f"{who} returned {error} at t = {t:.3f} s; return an array ({n}, 3) of forces, a row for each agent [N]"
@@ -176,22 +176,22 @@ class ExternalForce:
             return
 
         @cache
-        def places(address: int) -> Floats:
+        def array_at_address(address: int) -> Floats:
             """The array (N, 3) at an address; the kernel has few of them, and calls often."""
             return np.ctypeslib.as_array((ctypes.c_double * 3 * n).from_address(address))
 
-        def call(t: float, r: int, v: int, f: int, _: int) -> None:
-            x = places(r).copy(), places(v).copy()
+        def call_force(t: float, r: int, v: int, f: int, _: int) -> None:
+            x = array_at_address(r).copy(), array_at_address(v).copy()
             try:
                 if self.error is None:
                     answer = call_user("the force", f"at t = {t:.3f} s", force, t, *x)
-                    places(f)[:] = check_force(answer, n, "the force", t)
+                    array_at_address(f)[:] = check_force(answer, n, "the force", t)
                     return
             except BaseException as error:
                 self.error = error
-            places(f)[:] = math.nan
+            array_at_address(f)[:] = math.nan
 
-        self._keep = self._SIGNATURE(call)
+        self._keep = self._SIGNATURE(call_force)
         self.address = int(ctypes.cast(self._keep, ctypes.c_void_p).value or 0)
 
     def raise_user_error(self) -> None:

@@ -88,7 +88,7 @@ def establish(
     v = np.zeros_like(r) if velocity is None else _starts("velocity", velocity, mission.n_agents)
     if v.shape != r.shape:
         raise ValueError(f"velocity {v.shape} and position {r.shape} must have the same shape")
-    if (why := why_unfit(mission)) is not None:
+    if (why := why_unfit_for_establish(mission)) is not None:
         raise ValueError(f"{why}; vary such missions with `rigidfleet.sweep`")
     flights = _Flights(mission, r, v)
     ends = []
@@ -107,7 +107,7 @@ def establish(
     )
 
 
-def why_unfit(mission: Mission) -> str | None:
+def why_unfit_for_establish(mission: Mission) -> str | None:
     """Why a mission cannot be flown by `establish`; None if it can."""
     for index, phase in enumerate(mission.phases):
         if phase.control != "open" or phase.settle or not _serves_all_starts(mission, phase):
@@ -152,12 +152,12 @@ class _Flights:
         law = plan.problem.law._replace(mu=self.mission.damping(None))
         problem = plan.problem._replace(law=law)
         edges = [(int(i), int(j)) for i, j in plan.edges]
-        before = now.reference.values_of(plan.edges, _lengths(self.r, plan.edges))
+        before = now.reference.values_of(plan.edges, _edge_lengths(self.r, plan.edges))
         sums = [self.integral.get(edge, np.zeros(count)) for edge in edges]
         y = np.column_stack([self.r.reshape(count, -1), self.v.reshape(count, -1), *sums])
-        places, options = _flight_by_place(self.finished), self.mission.integrator
+        places, options = _flight_of_each_lane(self.finished), self.mission.integrator
         velocity = tolerance_of_velocity(options, now.r, problem.vehicles.m, law.beta, large=False)
-        shared = batch.fits(problem) if vectors is None else vectors
+        shared = batch.can_unroll(problem) if vectors is None else vectors
         ends = batch.fly_all(
             problem,
             y[places],
@@ -201,7 +201,7 @@ def _starts(name: str, values: ArrayLike, agents: int) -> Floats:
     return starts
 
 
-def _flight_by_place(finished: Bools) -> Ints:
+def _flight_of_each_lane(finished: Bools) -> Ints:
     """Flight in each place; a flight that is out leaves its place to a neighbour, so that all others keep theirs."""
     places = np.arange(len(finished))
     for k in np.flatnonzero(~finished):
@@ -213,10 +213,10 @@ def _flight_by_place(finished: Bools) -> Ints:
 
 def max_edge_error(r: Floats, edges: NDArray[np.integer], distances: Floats) -> Floats:
     """Greatest error (B,) [m] of edges (m, 2) against the lengths ``distances`` (m,) [m], at positions (B, N, 3)."""
-    return np.abs(_lengths(r, edges) - distances).max(axis=1, initial=0.0)
+    return np.abs(_edge_lengths(r, edges) - distances).max(axis=1, initial=0.0)
 
 
-def _lengths(r: Floats, edges: NDArray[np.integer]) -> Floats:
+def _edge_lengths(r: Floats, edges: NDArray[np.integer]) -> Floats:
     """Lengths (B, m) of edges [m]."""
     way = r.take(edges[:, 0], axis=1)
     way -= r.take(edges[:, 1], axis=1)

@@ -77,7 +77,7 @@ class CurveWatch:
         self.boundaries = BoundaryWatch(mission)
         self.n = len(fleet.radius)
         self.radius = np.array(fleet.radius, dtype=float)
-        self._take_obstacles(obstacles)
+        self._set_obstacles(obstacles)
         fence = limits.geofence
         self.fence = np.array([] if fence is None else [*fence.min, *fence.max]).reshape(-1, 6)
         lowest = limits.separation_altitude
@@ -104,8 +104,8 @@ class CurveWatch:
         self.touched: dict[str, Extremum] = {}  # first contacts of the flight
         self._list_all_pairs()
 
-    def _take_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        corners = [thing.corners for thing in obstacles]
+    def _set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        corners = [thing.box_bounds for thing in obstacles]
         #: Obstacles of all kinds, unless all are boxes that the monitor itself takes.
         self.solids = None
         if None in corners:
@@ -123,7 +123,7 @@ class CurveWatch:
             )
         )  # fmt: skip
 
-    def take_curves(self, clock: Floats, points: Floats) -> None:
+    def monitor_curves(self, clock: Floats, points: Floats) -> None:
         """Take curves of fourth degree with starts and lengths (S, 2) [s], by control points (S, 5, 6N).
 
         The first 3N are positions [m], the others velocities [m/s], world axes.
@@ -136,7 +136,7 @@ class CurveWatch:
             self._begin_monitor(points.shape[2], 0)
         count = np.zeros_like(state.count)
         count[records.TRAILED] = len(clock)
-        self.take_path(problem, work, state._replace(trail=trail, count=count))
+        self.monitor_paths(problem, work, state._replace(trail=trail, count=count))
 
     def keep_only(self, left: Bools) -> None:
         """Continue with the vehicles ``left`` (N,) alone, as if the others were not there."""
@@ -152,12 +152,12 @@ class CurveWatch:
         deepest = min(contacts, key=lambda x: x.value, default=None)
         return deepest if deepest is not None and deepest.value < -_TOUCH else None
 
-    def take_path(
+    def monitor_paths(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, first: int = 0
     ) -> None:
         """Evaluate the paths alone of the steps in a trail from ``first`` on, not the forces."""
         steps = int(state.count[records.TRAILED])
-        self._take_solids(problem, state, first, steps)
+        self._monitor_clearances(problem, state, first, steps)
         if self.boundaries.every:
             rows = _trail_rows(state, np.arange(first, steps))
             clock, points = state.trail.clock[rows], state.trail.points[rows]
@@ -204,14 +204,14 @@ class CurveWatch:
         self.worst.fill(-np.inf)  # nothing else is searched for
         self.worst[kind] = -_TOUCH
         arrays[-1][:] = 0
-        self._take_solids(problem, state, 0, len(steps[0]))
+        self._monitor_clearances(problem, state, 0, len(steps[0]))
         self.monitor.distances(problem, state, 0, len(steps[0]))
         contact = self._extremum(kind) if self.worst[kind] < -_TOUCH else None
         for array, own in zip(arrays, before, strict=True):
             array[...] = own
         return contact
 
-    def _take_solids(
+    def _monitor_clearances(
         self, problem: Problem, state: records.IntegratorState, first: int, end: int
     ) -> None:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
@@ -239,7 +239,7 @@ class CurveWatch:
         self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
         return extremes
 
-    def complete_phases(self, phases: Sequence[PhaseRecord]) -> None:
+    def add_flight_extremes(self, phases: Sequence[PhaseRecord]) -> None:
         """Give the phases of a finished flight its first contacts, and its clearances in flight and on an obstacle."""
         extremes: dict[str, Extremum | None] = dict(self.touched)
         if self.solids is not None or len(self.boxes):
@@ -348,9 +348,9 @@ class CurveWatch:
     def _watch_listed_pairs(self, spare: float) -> None:
         """Monitor the listed pairs; no others matter until distances have changed by ``spare`` [m]."""
         self.spare, self.moved[:] = spare, 0.0
-        self._renew_monitor(pairs=self.pairs, columns=self.columns)
+        self._replace_monitor_arrays(pairs=self.pairs, columns=self.columns)
 
-    def _renew_monitor(self, **arrays: Any) -> None:
+    def _replace_monitor_arrays(self, **arrays: Any) -> None:
         """Go on with other arrays in place of some."""
         before = self.monitor.monitor
         self.monitor = native.Watch(before._replace(count=before.count.copy(), **arrays))
@@ -372,9 +372,9 @@ class Extremes(CurveWatch):
 
     def use_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Continue among these obstacles; the first of them are those before."""
-        self._take_obstacles(obstacles)
+        self._set_obstacles(obstacles)
         if "monitor" in vars(self):
-            self._renew_monitor(boxes=self.boxes)
+            self._replace_monitor_arrays(boxes=self.boxes)
 
     def begin_monitoring(
         self,
@@ -413,21 +413,21 @@ class Extremes(CurveWatch):
         self._list_all_pairs()
         self.size = None  # other vehicles are monitored from now on
 
-    def take_steps(
+    def monitor_steps(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
     ) -> None:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
-        self.take_path(problem, work, state, int(self.monitor.monitor.count[records.STAYED]))
+        self.monitor_paths(problem, work, state, int(self.monitor.monitor.count[records.STAYED]))
         self.monitor.search_forces(problem, work, state, last=last)
 
-    def free_steps(self, state: records.IntegratorState) -> int:
+    def steps_until_trail_full(self, state: records.IntegratorState) -> int:
         """Number of steps for which the trail has room beside those that another thread evaluates."""
         # Beside as many others, and one that has stayed.
         half = (len(state.trail.clock) - 1) // 2
         return half + 1 - int(state.count[records.TRAILED])
 
     def hand_over(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
-        """Let another thread evaluate the steps in the trail, `take_steps`; no more than `free_steps` may follow.
+        """Let another thread evaluate the steps in the trail; no more than `steps_until_trail_full` may follow.
 
         Until `wait_for_steps`, only that thread may use this monitor, ``work``, and what the problem's law changes.
         """
@@ -439,10 +439,10 @@ class Extremes(CurveWatch):
             from concurrent.futures import ThreadPoolExecutor
 
             self._thread = ThreadPoolExecutor(1)
-        self._taking = self._thread.submit(self._take_steps_aside, problem, work, taken)
+        self._taking = self._thread.submit(self._monitor_steps_in_thread, problem, work, taken)
 
-    def _take_steps_aside(self, *arguments: Any) -> None:
-        self.take_steps(*arguments, last=False)
+    def _monitor_steps_in_thread(self, *arguments: Any) -> None:
+        self.monitor_steps(*arguments, last=False)
         packing.forget_last_packed()  # the phase may be over before this thread packs others
 
     def wait_for_steps(self) -> None:
@@ -453,7 +453,7 @@ class Extremes(CurveWatch):
             if error is not None:
                 raise error
 
-    def take_vehicles(
+    def take_vehicle_extremes(
         self,
         state: fleet.SampledState,
         vehicles: fleet.Quadrotors,

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet.errors import FlightError, MissionError, StoppedError, wrong_type
 from rigidfleet.kernel.avoidance import with_obstacles
 from rigidfleet.kernel.problem import TRACKING, External, Motion, workspace
@@ -22,7 +23,7 @@ from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
 from rigidfleet.planning.disturbances import mission_disturbance
 from rigidfleet.planning.legs import Leg, state_at_start
-from rigidfleet.planning.losses import Answer, answer_to, legs_from
+from rigidfleet.planning.losses import Answer, answer_to_loss, legs_from
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, Pose, copy_with
 from rigidfleet.planning.timing import complete_times, timed_leg
@@ -185,6 +186,9 @@ def simulate(
     return flight.finish()
 
 
+@with_earlier_names(
+    arrive="end_phase_if_over", among="replace_obstacles", contact="deepest_contact"
+)
 class Flight:
     """A mission flown step by step.
 
@@ -383,7 +387,7 @@ class Flight:
             leg = timed_leg(self.mission, phase, self._state_now, len(self._phases_begun))
             plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
-            self._check_frame(plan)
+            self._check_not_flipped(plan)
             fly = PointPhase
             if self._vehicles is not None:
                 fly = partial(SampledPhase, vehicles=self._vehicles)
@@ -394,7 +398,7 @@ class Flight:
             )  # fmt: skip
         except MissionError as error:
             # Only where a flight leaves it open can a phase of the mission be impossible: the rest are errors.
-            if by_hand or not (phase.automatic or phase.follows_curves):
+            if by_hand or not (phase.auto_keys or phase.follows_curves):
                 raise
             self.ending = "; ".join(f"phase '{phase.name}' {f.problem}" for f in error.findings)
             return False
@@ -450,9 +454,9 @@ class Flight:
         except BaseException:
             self._leave_phase()
             raise
-        return self.arrive()
+        return self.end_phase_if_over()
 
-    def arrive(self) -> bool:
+    def end_phase_if_over(self) -> bool:
         """End the phase under way if it is over; return whether it goes on, as `advance` does."""
         active = self.under_way()
         plan, settle, loss = active.plan, active.plan.phase.settle, self._next_loss()
@@ -499,7 +503,7 @@ class Flight:
             feedback = problem.feedback._replace(
                 arrival=t, r=start.r, v=start.v, T1=np.ascontiguousarray(start.T), omega=start.omega
             )
-            active.continue_by_hand(problem._replace(feedback=feedback, external=external))
+            active.switch_problem_by_hand(problem._replace(feedback=feedback, external=external))
             return
         (r, v, a_end), (phi, omega, alpha_end) = end, turn
         zero = np.zeros(3)
@@ -510,7 +514,7 @@ class Flight:
         times = np.array([t, t + h])
         pieces = np.ascontiguousarray(lqr.quintic_pieces(times, x, x_dot, x_ddot))
         motion = Motion(times, pieces, np.ascontiguousarray(start.T))
-        active.continue_by_hand(problem._replace(motion=motion, external=external))
+        active.switch_problem_by_hand(problem._replace(motion=motion, external=external))
 
     def finish(self, ending: str = "") -> Result:
         """End the flight; return its record.
@@ -539,7 +543,7 @@ class Flight:
             self.ending = f"ended at t = {self.t:.2f} s, before the mission's end"
         self._finished = True
         if self._ended is not None:  # no phase follows
-            self._ended.release()
+            self._ended.free_memory()
             self._ended = None
         return self.record(self.pieces, None if own else self._phases_begun)
 
@@ -571,7 +575,7 @@ class Flight:
             last = max(piece.phase for piece in pieces) + 1
             step = step or mission.output_step
             mission, phases = mission_as_flown(mission, flown[:last], phases[:last], step)
-        self._extremes.complete_phases(phases)
+        self._extremes.add_flight_extremes(phases)
         evaluations, steps, rejected = self._count.tolist()
         statistics = {
             "evaluations": evaluations, "steps": steps, "rejected": rejected,
@@ -592,7 +596,7 @@ class Flight:
         result.mission = mission  # keeps the slots assigned and edges that it has computed
         return result
 
-    def among(self, obstacles: Sequence[Obstacle]) -> None:
+    def replace_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Fly on among these obstacles: the first are those before, others may be new or move in other ways.
 
         `mission` has them from now on, its text has not.
@@ -606,7 +610,7 @@ class Flight:
             solids = join_solids([thing.solid for thing in obstacles])
             vehicles.avoidance = with_obstacles(vehicles.avoidance, solids)
 
-    def contact(self) -> Extremum | None:
+    def deepest_contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far, with vehicle and obstacle, or None."""
         if self._active is not None:
             self._active.search_extremes(last=True)
@@ -619,7 +623,7 @@ class Flight:
         """The state from which the next phase starts, evaluated when it is asked for: none follows the last."""
         if self._ended is not None:
             self._reached = self._ended.end()
-            self._ended.release()
+            self._ended.free_memory()
             self._ended = None
         return self._reached
 
@@ -657,14 +661,14 @@ class Flight:
         if lost.any():
             self._extremes.remove_lost(lost)
             self._state_now.lost = lost
-        self._answer = answer_to(self.mission, self._state_now, self._whole_plan)
+        self._answer = answer_to_loss(self.mission, self._state_now, self._legs_begun_and_ahead)
         legs = self._answer.legs
         if legs:
             self._reached = legs[0].before
         self._route = [*self._phases_begun, *(leg.phase for leg in legs)]
         self._following = len(self._phases_begun)
 
-    def _whole_plan(self) -> list[Leg]:
+    def _legs_begun_and_ahead(self) -> list[Leg]:
         """The legs of the phases begun, and of those of the route that were to follow."""
         plan: list[Leg] = []
         for leg, record in zip(self._plans, self.phases, strict=True):
@@ -718,9 +722,9 @@ class Flight:
         if not abandoned and (
             active.has_settled or active.is_over or active.t >= active.plan.arrival
         ):
-            record.stay = active.plan.stay_target(active.t)
+            record.stay = active.plan.end_state_record(active.t)
 
-    def _check_frame(self, plan: PhasePlan) -> None:
+    def _check_not_flipped(self, plan: PhasePlan) -> None:
         """Stop if the formation has flipped: its slots no longer agree with the body frame."""
         both = {plan.phase.control, *(phase.control for phase in self._phases_begun[-1:])}
         now = self._state_now

@@ -73,7 +73,7 @@ class LeaderState(NamedTuple):
     deviation: Detour
 
 
-def _polynomials(times: Floats, ends: Floats) -> Floats:
+def _quintics(times: Floats, ends: Floats) -> Floats:
     """Quintics (K, ..., 6) between times (K + 1,) [s], by values and two derivatives (3, 2 K, ...) at their ends."""
     pairs = ends.reshape(3, -1, 2, *ends.shape[2:])
     parts = [lqr.quintic_pieces(times[k : k + 2], *pairs[:, k]) for k in range(len(times) - 1)]
@@ -157,7 +157,7 @@ class Leader:
         since, (x, v, _) = (time - self.now.begun)[:, None], self.now.deviation.x
         return x + since * v
 
-    def extremes(self, t: float) -> dict[str, Extremum]:
+    def layer_extremes(self, t: float) -> dict[str, Extremum]:
         """What the layers did by t [s]: delay [s], and share of the time in which the body deviated."""
         extremes = {}
         if self.waited is not None:
@@ -275,11 +275,11 @@ class Leader:
         B = series.product(np.moveaxis(turns, -1, 1), np.moveaxis(B, -1, 1), np.matmul)
         phi = series.derivatives(series.rotation_vector_series(B[0, 0].T @ B))
         channels = np.concatenate([x.transpose(0, 2, 1), phi], axis=2)  # (3, ends, 6)
-        polynomials = Motion(times, _polynomials(times, channels), np.ascontiguousarray(B[0, 0].T))
+        polynomials = Motion(times, _quintics(times, channels), np.ascontiguousarray(B[0, 0].T))
         late, scaled = delay_by(problem, self.clock.delay).reference, self._is_any_scaled(ends)
         if not (p[1:].any() or scaled):
             return problem._replace(motion=polynomials, reference=late)
-        ways = _polynomials(times, p.transpose(0, 3, 2, 1))
+        ways = _quintics(times, p.transpose(0, 3, 2, 1))
         kind = SHAPE if scaled else reference.kind
         return problem._replace(
             motion=polynomials, reference=late._replace(kind=kind, knots=times, ways=ways)
@@ -301,8 +301,8 @@ class Leader:
         r, v, rise, arms = self._slot_motion(t)
         z = self.deviation.scale[0]
         limit = _STEERING * float(a.b.min())
-        cones = (self._cones(o, r, v, rise, a) for o in moving)
-        rows, needed, who = self._rows_of(cones, arms, limit)
+        cones = (self._moving_obstacle_barriers(o, r, v, rise, a) for o in moving)
+        rows, needed, who = self._barrier_rows(cones, arms, limit)
         if len(rows):
             accelerations = self.deviation.decay(NEAR)
         short = needed - rows @ accelerations
@@ -313,9 +313,9 @@ class Leader:
             self.who = int(who[short.argmax()])
         # Off the planned path, what stands still counts, too
         barriers = (self._barriers(o, r, v, rise, a) for o in np.flatnonzero(sight.moves == 0))
-        more, least, _ = self._rows_of(barriers, arms, limit)
+        more, least, _ = self._barrier_rows(barriers, arms, limit)
         rows, needed = np.vstack([rows, more]), np.append(needed, least)
-        if self._is_any_scaled([self.deviation]) or self._is_scalable:
+        if self._is_any_scaled([self.deviation]) or self._can_scale_slots:
             more, least = scale_bound_rows(self.deviation)
             rows, needed = np.vstack([rows, more]), np.append(needed, least)
         else:
@@ -330,7 +330,7 @@ class Leader:
         return accelerations + min(1.0, limit / max(greatest, 1e-12)) * change
 
     @cached_property
-    def _is_scalable(self) -> bool:
+    def _can_scale_slots(self) -> bool:
         """Whether slots may be scaled: their distances are those of the edges."""
         plan = self.plan
         if plan.slots is None:
@@ -363,7 +363,7 @@ class Leader:
         a = c[2] + d[0] @ Q[2].T + 2.0 * d[1] @ Q[1].T + turned[2]
         return r, v, a, turned[0]
 
-    def _rows_of(
+    def _barrier_rows(
         self, barriers: Iterable[tuple[Floats, Floats]], arms: Floats, limit: float
     ) -> tuple[Floats, Floats, Ints]:
         """Rows (R, 7) of the barriers that may act, what they need (R,), and the vehicles (R,)."""
@@ -375,7 +375,7 @@ class Leader:
         rows, needed, who = (np.concatenate(each) for each in zip(*parts, strict=True))
         return rows, needed, who
 
-    def _cones(
+    def _moving_obstacle_barriers(
         self, o: int, r: Floats, v: Floats, rise: Floats, a: AvoidanceArrays
     ) -> tuple[Floats, Floats]:
         """Normals (N, 3) of barriers of slots against obstacle o, which moves, and what they need (N,) along these.
@@ -402,7 +402,7 @@ class Leader:
     def _barriers(
         self, o: int, r: Floats, v: Floats, rise: Floats, a: AvoidanceArrays
     ) -> tuple[Floats, Floats]:
-        """Barriers of slots against obstacle o, which stands still; see `_cones`."""
+        """Barriers of slots against obstacle o, which stands still; see `_moving_obstacle_barriers`."""
         solids = a.solids
         at = in_own_axes(*r.T, o, solids)
         away = signed_distance(*at, o, solids)

@@ -15,7 +15,7 @@ from rigidfleet.errors import FlightError
 from rigidfleet.kernel.fleet import ANSWERED, TICKS, SampledFlight, SampledState
 from rigidfleet.kernel.mail import NONE
 from rigidfleet.kernel.problem import TRACKING, Problem, Workspace
-from rigidfleet.simulation.callbacks import call_user, finite_numbers
+from rigidfleet.simulation.callbacks import call_user, copy_finite_array
 from rigidfleet.typing import Floats
 
 
@@ -115,7 +115,7 @@ class OwnLaws:
                 continue
             answer = call_user(f"the law of agent {i + 1}", where, self.laws[i], view)
             try:
-                state.f_u[i], said[i], numbers = _answer_of(answer)
+                state.f_u[i], said[i], numbers = _parse_law_answer(answer)
             except ValueError as unfit:
                 what, remedy = unfit.args
                 what = f"the law of agent {i + 1} returned {what} {where}: {remedy}"
@@ -125,7 +125,7 @@ class OwnLaws:
         self.said.append(said)
         state.count[ANSWERED] = k + 1
 
-    def has_views(self, problem: Problem, state: SampledState) -> bool:
+    def has_current_views(self, problem: Problem, state: SampledState) -> bool:
         """Whether the views last made are those of the tick that comes."""
         last = self.last
         return last is not None and last[0] == state.count[TICKS] and last[1] is problem
@@ -135,7 +135,7 @@ class OwnLaws:
     ) -> list[View | None]:
         """What each vehicle knows at the tick that comes, as the kernel has it ready; None for those that are lost."""
         k, mail = int(state.count[TICKS]), state.mail
-        if self.last is not None and self.has_views(problem, state):
+        if self.last is not None and self.has_current_views(problem, state):
             return self.last[2]
         t, dt, g = k * self.tick, self.every * self.tick, problem.vehicles.g
         has_heard = mail.stamp >= 0
@@ -169,7 +169,7 @@ class OwnLaws:
         return views
 
 
-def _answer_of(answer: Any) -> tuple[Floats, Any, int]:
+def _parse_law_answer(answer: Any) -> tuple[Floats, Any, int]:
     """Force (3,) [N] of what a law returned, a copy of its message, and how many numbers that has.
 
     Raises
@@ -182,7 +182,7 @@ def _answer_of(answer: Any) -> tuple[Floats, Any, int]:
     except (TypeError, ValueError):
         raise ValueError(repr(answer), "return a force (3,) [N] and a message") from None
     try:
-        f = finite_numbers(force, (3,))
+        f = copy_finite_array(force, (3,))
     except ValueError as error:
         what = f"as its force {error}"
         raise ValueError(what, "return a force (3,) [N], weight included, and a message") from None

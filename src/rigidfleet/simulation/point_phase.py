@@ -73,7 +73,7 @@ class PointPhase(ActivePhase):
         try:
             while status == records.PAUSED:
                 begun = clock.perf_counter()
-                most = self.extremes.free_steps(state) if self.aside else self.steps
+                most = self.extremes.steps_until_trail_full(state) if self.aside else self.steps
                 status = go_on(fresh, min(self.steps, most))
                 took = max(clock.perf_counter() - begun, 1e-6)
                 if status == records.PAUSED:
@@ -84,7 +84,7 @@ class PointPhase(ActivePhase):
                 self.raise_errors()
                 full = state.count[records.TRAILED] == len(state.trail.clock)
                 if self.aside:
-                    full = self.extremes.free_steps(state) < 1
+                    full = self.extremes.steps_until_trail_full(state) < 1
                 if status == records.PAUSED or full:
                     self.search_extremes(last=False)
                 self.pause(self.t)
@@ -108,7 +108,7 @@ class PointPhase(ActivePhase):
             return
         work = self.workspace if self.solver is None else self.solver.solver_for_thread.workspace
         if last or not self.aside:
-            self.extremes.take_steps(self.flown, work, self.state, last=last)
+            self.extremes.monitor_steps(self.flown, work, self.state, last=last)
         else:
             self.extremes.hand_over(self.flown, work, self.state)
 
@@ -149,7 +149,7 @@ class PointPhase(ActivePhase):
             " not take; return forces [N], or give the agents a vehicle"
         )
 
-    def release(self) -> None:
+    def free_memory(self) -> None:
         """Let go of what a large formation has packed."""
         if self.solver is not None:
             packing.forget_last_packed()

@@ -222,7 +222,7 @@ class SampledPhase(ActivePhase):
         if self.slowed is None and (self.sampled.tau[:, PACE] < _SLOWED).any():
             self.slowed = t, int(self.sampled.tau[:, WORST].argmax())
 
-    def continue_by_hand(self, problem: Problem) -> None:
+    def switch_problem_by_hand(self, problem: Problem) -> None:
         """Take up a problem that was made by hand: the layers above the barriers then rest."""
         self.steered = True
         if self.leader is not None:
@@ -236,7 +236,7 @@ class SampledPhase(ActivePhase):
             now = tables.yaw_at(self.plan.problem, t, self.turn)
             self.turn = yaw_turn_from(problem, t, tables.yaw, now)
         self.by_pieces = True
-        super().continue_by_hand(problem)
+        super().switch_problem_by_hand(problem)
 
     def observe(self) -> Observation:
         """What a controller sees: states of now or, with noise, as the law knows them at a tick and until the next."""
@@ -254,7 +254,7 @@ class SampledPhase(ActivePhase):
 
     def _measure_if_due(self) -> None:
         """Measure what the law will know if a tick is due."""
-        self._supply_tables()
+        self._supply_tick_tables()
         now = fleet.sampled_segment(len(self.sampled.S), len(self.plan.edges), self.t, max_steps=0)
         fly_ticks(self.plan.problem, self.workspace, self.flight, self.sampled, now)
 
@@ -294,7 +294,7 @@ class SampledPhase(ActivePhase):
         """Search the steps flown for extremes."""
         self.extremes.avoidance = self.vehicles.avoidance
         if self.leader is not None:
-            self.extremes.of_layers = self.leader.extremes(self.t)
+            self.extremes.of_layers = self.leader.layer_extremes(self.t)
         if self.slowed is not None:
             time, who = self.slowed
             self.extremes.of_layers = {"clock": Extremum(self.event_delay, time, who, -1)}
@@ -305,13 +305,13 @@ class SampledPhase(ActivePhase):
             if not -_FAR < points.min() <= points.max() < _FAR:  # NaN is not, either
                 rows = int((abs(points) < _FAR).all(axis=(1, 2)).argmin())
             self.state.count[records.TRAILED] = rows
-            self.extremes.take_path(self.flown, self.workspace, self.state)
+            self.extremes.monitor_paths(self.flown, self.workspace, self.state)
             self.sampled.count[fleet.TRAILED] = self.state.count[records.TRAILED] = 0
             self.unjudged = True
         if last and self.unjudged:  # the rest is kept by the flight itself
             assert self.first_tick is not None  # it has begun
             ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
-            self.extremes.take_vehicles(
+            self.extremes.take_vehicle_extremes(
                 self.sampled, self.flight.vehicles, self.gone, self.lost, ticks
             )
             self.unjudged = False
@@ -328,12 +328,12 @@ class SampledPhase(ActivePhase):
             self.flight = self.flight._replace(network=network)
         call = fleet.sampled_segment(n, m, t_end, times, _STEPS, links=len(network.links))
         sampled.count[fleet.SAMPLES] = 0
-        looked = laws is not None and laws.has_views(problem, sampled)
+        looked = laws is not None and laws.has_current_views(problem, sampled)
         status = records.ASKS if looked else records.PAUSED
         try:
             while status in (records.PAUSED, records.ASKS):
                 if status == records.PAUSED:
-                    self._supply_tables()
+                    self._supply_tick_tables()
                 elif laws is not None:
                     laws.call_laws(plan.phase.name, problem, self.workspace, self.flight, sampled)
                 status = fly_ticks(problem, self.workspace, self.flight, sampled, call, arrays)
@@ -372,7 +372,7 @@ class SampledPhase(ActivePhase):
             own = self.external is not None
             raise StoppedError(diagnose(self, own_force=own, collapsed=True))
 
-    def _supply_tables(self) -> None:
+    def _supply_tick_tables(self) -> None:
         """Make tables for the next ticks, if those that there are end here or belong to another reference."""
         tables, tick = self.flight.tables, int(self.sampled.count[fleet.TICKS])
         planned, source = self.plan.problem, self.vehicles.tables

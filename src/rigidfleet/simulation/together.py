@@ -62,7 +62,7 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
             if not _fly_in_common_steps(points, vector):
                 return [simulate(mission) for mission in missions]
             for flight in flights:
-                flight.arrive()
+                flight.end_phase_if_over()
             continue
         for flight, goes in zip(flights, going, strict=True):
             while goes and flight.advance():
@@ -76,7 +76,7 @@ def _can_share_steps(active: Sequence[ActivePhase]) -> bool:
         return False
     from rigidfleet.kernel.engine import batch
 
-    return batch.fit_together([phase.plan.problem for phase in active])
+    return batch.can_unroll_together([phase.plan.problem for phase in active])
 
 
 def _can_fly_together(phase: ActivePhase) -> bool:

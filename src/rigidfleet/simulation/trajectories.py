@@ -37,7 +37,7 @@ from rigidfleet.result import Extremum, PhaseRecord, Result, presence
 from rigidfleet.result.result import CLOSE, VARIABLES
 from rigidfleet.setpoints import sample_intervals
 from rigidfleet.simulation.extremes import CurveWatch
-from rigidfleet.simulation.recording import distances, recorded_text
+from rigidfleet.simulation.recording import distances, mission_text_entry
 from rigidfleet.typing import Floats, Ints
 
 #: Greatest distance [m] of a curve of fourth degree from the piece that it stands for, and most parts of a piece.
@@ -295,7 +295,7 @@ def result_of_curve(
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
     watch.keep_only(np.ones(n, dtype=np.bool_))  # whose data end near an obstacle has not left it
     record.extremes.update(watch.end_phase())
-    watch.complete_phases([record])
+    watch.add_flight_extremes([record])
     record.extremes.update(fastest)
     at, state, yaws = _sample_curve(curve, parts)
     if powers < 3:  # lines turn at once at samples
@@ -453,7 +453,7 @@ def _watch_positions(
         at = [x.at_shares(records.KNOTS) for x in (part, part.derivative_curve())]
         points = np.concatenate([x.reshape(*x.shape[:2], -1) for x in at], axis=2)
         clock = np.column_stack([part.time[:-1], np.diff(part.time)])
-        watch.take_curves(clock, records.FROM_KNOTS @ points)
+        watch.monitor_curves(clock, records.FROM_KNOTS @ points)
 
 
 def _count_parts(way: Piecewise) -> Ints:
@@ -515,7 +515,7 @@ def result_of(
         statistics=statistics, **ending,
         later=[
             (CLOSE, partial(distances, mission, worst, r, time, left)),
-            (("mission_text",), partial(recorded_text, mission)),
+            (("mission_text",), partial(mission_text_entry, mission)),
         ],
     )  # fmt: skip
     # Its text is written where the result is, and need not be read.

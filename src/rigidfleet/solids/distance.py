@@ -107,7 +107,7 @@ def cylinder_normal(x: Numbers, y: Numbers, z: Numbers, size: Any) -> Any:
 # -- triangles -----------------------------------------------------------------------------------------
 
 
-def segment_to_point(x: Numbers, y: Numbers, z: Numbers, a: Any, b: Any) -> Any:
+def vector_from_segment(x: Numbers, y: Numbers, z: Numbers, a: Any, b: Any) -> Any:
     """Vector from the nearest point of the segment between a and b (3,) to the point."""
     u, v, w = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     x, y, z = x - a[0], y - a[1], z - a[2]
@@ -132,14 +132,14 @@ def facet_normal(t: Any) -> Any:
     return f * r - g * q, g * p - e * r, e * q - f * p
 
 
-def triangle_to_point(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
+def vector_from_triangle(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
     """Vector from the nearest point of a triangle (3, 3) to the point, and its squared length."""
     a, b, c, n = t[0], t[1], t[2], facet_normal(t)
     area = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
-    i, j, k = segment_to_point(x, y, z, a, b)
+    i, j, k = vector_from_segment(x, y, z, a, b)
     best = i * i + j * j + k * k
     for m in range(1, 3):
-        u, v, w = segment_to_point(x, y, z, t[m], t[(m + 1) % 3])
+        u, v, w = vector_from_segment(x, y, z, t[m], t[(m + 1) % 3])
         d = u * u + v * v + w * w
         nearer = d < best
         i, j, k, best = choose(nearer, (u, v, w, d), (i, j, k, best))
@@ -155,7 +155,7 @@ def triangle_to_point(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
 # -- surfaces of triangles -----------------------------------------------------------------------------
 
 
-def surface_to_point(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+def vector_from_surface(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     """Vector from the nearest point of the surface of solid b, of triangles, to the point, and its squared length."""
     first, last = s.first[b], s.last[b]
     t = s.triangles[first[1]]
@@ -171,7 +171,7 @@ def surface_to_point(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
             node = s.after[node]
             continue
         for m in range(s.leaf[node, 0], s.leaf[node, 1]):
-            u, v, w, d = triangle_to_point(x, y, z, s.triangles[m])
+            u, v, w, d = vector_from_triangle(x, y, z, s.triangles[m])
             nearer = d < best
             i, j, k, best = choose(nearer, (u, v, w, d), (i, j, k, best))
         node += 1
@@ -222,7 +222,7 @@ def signed_distance(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Numbe
         return near
     if kind == CYLINDER:
         return cylinder_distance(x, y, z, s.size[b])
-    _, _, _, squared = surface_to_point(x, y, z, b, s)
+    _, _, _, squared = vector_from_surface(x, y, z, b, s)
     away = np.sqrt(squared)
     return where(is_inside(x, y, z, b, s), -away, away)
 
@@ -234,7 +234,7 @@ def outward_normal(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
         return box_normal(x, y, z, s.size[b])
     if kind == CYLINDER:
         return cylinder_normal(x, y, z, s.size[b])
-    i, j, k, squared = surface_to_point(x, y, z, b, s)
+    i, j, k, squared = vector_from_surface(x, y, z, b, s)
     away = np.sqrt(squared)
     away = where(is_inside(x, y, z, b, s), -away, away)
     known = squared > 0.0
@@ -330,6 +330,7 @@ def height_below(x: Numbers, y: Numbers, z: Numbers, s: Any) -> Numbers:
 #: The functions that the kernel compiles, each after those that it calls.
 ELEMENTWISE = (
     choose, box_distance, box_normal, cylinder_distance, cylinder_normal,
-    segment_to_point, edge_side, facet_normal, triangle_to_point, height_map_point, surface_to_point, is_inside,
-    signed_distance, outward_normal, solid_displacement, is_present, in_own_axes, is_below, height_range, height_below,
+    vector_from_segment, edge_side, facet_normal, vector_from_triangle, height_map_point, vector_from_surface,
+    is_inside, signed_distance, outward_normal, solid_displacement, is_present, in_own_axes, is_below, height_range,
+    height_below,
 )  # fmt: skip

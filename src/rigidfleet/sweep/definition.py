@@ -20,11 +20,11 @@ import numpy as np
 from pydantic import Field, Strict
 
 from rigidfleet._common.arguments import as_path
-from rigidfleet._common.renamed import rename_hint
+from rigidfleet._common.renamed import rename_hint, with_earlier_names
 from rigidfleet._version import __version__
 from rigidfleet.errors import MissionError, RigidfleetError, SweepError, wrong_type
 from rigidfleet.mission import Mission, load_mission, mission_names
-from rigidfleet.mission.findings import FindingCollector, Keys, look_up, unknown_key
+from rigidfleet.mission.findings import FindingCollector, Keys, look_up, unknown_key_in_words
 from rigidfleet.mission.loading import as_mission
 from rigidfleet.mission.text import parse_toml, read_text
 from rigidfleet.mission.values import Part, key, required_key
@@ -86,7 +86,7 @@ class SweepHeader(Part):
     drill: Drill | None = key("faults of the day, in turn, instead of what varies: [drill]")
 
     @property
-    def own_law(self) -> tuple[str, str]:
+    def law_key_and_name(self) -> tuple[str, str]:
         """Key of the user's law and its name; the name is "" if the laws of the mission fly."""
         return ("agent", self.agent) if self.agent else ("controller", self.controller)
 
@@ -104,16 +104,17 @@ class SweepColumn:
         return keypaths.path_of_keys(self.keys)
 
     @property
-    def in_words(self) -> bool:
+    def has_non_numbers(self) -> bool:
         """Whether some of its values are no numbers."""
         return not all(map(is_number, getattr(self.variation, "values", ())))
 
     @property
-    def in_order(self) -> bool:
+    def has_order(self) -> bool:
         """Whether its values have an order; those of seeds have none."""
-        return not self.in_words and self.keys[-1] != "seed"
+        return not self.has_non_numbers and self.keys[-1] != "seed"
 
 
+@with_earlier_names(document="mission_document", varied="document_of_run")
 class Sweep:
     """A checked sweep. Create one by `Sweep.of`, or from a file by `Sweep.load`.
 
@@ -219,7 +220,7 @@ class Sweep:
         variations, header = _Check(data, origin, mission).variations_and_header()
         assert mission is not None  # otherwise the check has raised
         if header.drill:
-            drill = header.drill.from_folder(path.parent)
+            drill = header.drill.with_files_in_folder(path.parent)
             header = header.model_copy(update={"drill": drill})
         return cls(mission, variations, header, path.stem)
 
@@ -241,7 +242,7 @@ class Sweep:
         """Everything on which a run depends besides its number. The number of runs is not included: it may grow."""
         data = self._definition_data()
         del data["runs"], data["name"]
-        files = {"code": self.law[1], "files": self.drill.digest if self.drill else ""}
+        files = {"code": self.law[1], "files": self.drill.files_digest if self.drill else ""}
         return data | {"version": __version__} | {key: x for key, x in files.items() if x}
 
     @cached_property
@@ -253,7 +254,7 @@ class Sweep:
         RigidfleetError
             It cannot be imported.
         """
-        key, name = self.header.own_law
+        key, name = self.header.law_key_and_name
         if not name:
             return None, ""
         try:
@@ -264,18 +265,18 @@ class Sweep:
     @property
     def version(self) -> str:
         """What flies it: the version of rigidfleet, and the user's controller."""
-        name = self.header.own_law[1]
+        name = self.header.law_key_and_name[1]
         law = f" with {name} {self.law[1][:8]}" if name else ""
         return f"rigidfleet {__version__}{law}"
 
     @property
-    def random(self) -> bool:
+    def has_random_numbers(self) -> bool:
         """Whether the first run has random numbers: of noise, gusts, network or sensing."""
         tables = (*_SEEDED[:3], ("avoidance", "sensing_noise"))
-        return any(look_up(self.varied(0), keys) for keys in tables)
+        return any(look_up(self.document_of_run(0), keys) for keys in tables)
 
     @property
-    def document(self) -> dict[str, Any]:
+    def mission_document(self) -> dict[str, Any]:
         """The mission as plain data, as written."""
         return self.mission.to_dict()
 
@@ -287,9 +288,9 @@ class Sweep:
     @cached_property
     def columns(self) -> list[SweepColumn]:
         """All numbers that vary, in order."""
-        return [SweepColumn(v, keys) for v in self.variations for keys in self._places(v.path)]
+        return [SweepColumn(v, keys) for v in self.variations for keys in self._keys_like(v.path)]
 
-    def _places(self, path: str) -> list[Keys]:
+    def _keys_like(self, path: str) -> list[Keys]:
         """Keys of all places that match a path; a case of a drill is none of the mission."""
         return [tuple(path.split("."))] if self.drill else keypaths.expand_path(self.whole, path)
 
@@ -314,7 +315,7 @@ class Sweep:
             for k, c in enumerate(self.columns)
         ]
 
-    def varied(
+    def document_of_run(
         self, run: int, values: Sequence[Any] | None = None, mission: Mission | None = None
     ) -> dict[str, Any]:
         """The mission of a run as plain data, not yet checked.
@@ -348,9 +349,9 @@ class Sweep:
         """
         if self._mission_with_ways is not self.mission:
             with suppress(MissionError):  # errors are told of the mission as written
-                document = self.varied(run, values, self._mission_with_ways)
+                document = self.document_of_run(run, values, self._mission_with_ways)
                 return Mission.from_plain(document, f"run {run}")
-        return Mission.from_plain(self.varied(run, values), f"run {run}")
+        return Mission.from_plain(self.document_of_run(run, values), f"run {run}")
 
     @cached_property
     def _mission_with_ways(self) -> Mission:
@@ -453,7 +454,7 @@ class _Check:
         known = [*SweepHeader.model_fields, "vary"]
         for name in self.data:
             if name not in known:
-                self.add((name,), *unknown_key(name, known))
+                self.add((name,), *unknown_key_in_words(name, known))
         own = {key: value for key, value in self.data.items() if key in SweepHeader.model_fields}
         header = self.collector.validate(SweepHeader, own, ())
         if "drill" not in self.data:
@@ -475,10 +476,10 @@ class _Check:
             problem = "has no effect: without [network], one law knows all states"
             self.add(("drill", "links"), problem, "remove it, or add [network] to the mission")
         n = 1 if self.mission is None else self.mission.n_agents
-        for name, most in faults.greatest_sizes(n).items():
+        for name, most in faults.fault_sizes(n).items():
             if name in drill.model_fields_set and max(getattr(drill, name), default=0) > most:
                 self.add(("drill", name), f"is too much for {n} vehicles", f"give at most {most}")
-        grids = drill.grids(n)
+        grids = drill.case_grids(n)
         if not (grids or self.collector.findings):
             self.add(("drill",), "has no magnitude", "give some, such as late = [1, 2]")
         return grids
@@ -494,14 +495,14 @@ class _Check:
                 self._check_places(k, path, variation, starts=by_final_states)
             variations += [] if variation is None else [variation]
         if by_final_states and self.mission is not None:
-            from rigidfleet.simulation.ensemble import why_unfit
+            from rigidfleet.simulation.ensemble import why_unfit_for_establish
 
-            if (why := why_unfit(self.mission)) is not None:
+            if (why := why_unfit_for_establish(self.mission)) is not None:
                 self.add(("evaluate",), why, _WHOLE, "final")
         if self.mission is not None:
-            self._check_values(self.mission)
-        if header is not None and header.own_law[1]:
-            self._check_own_law(*header.own_law, header)
+            self._check_added_keys(self.mission)
+        if header is not None and header.law_key_and_name[1]:
+            self._check_own_law(*header.law_key_and_name, header)
         if "rate" in self.data and not self.data.get("controller"):
             self.add(("rate",), "is that of a controller", "give a controller, or remove rate")
         self._check_groups(variations)
@@ -573,7 +574,7 @@ class _Check:
                 continue
             self.add(where, problem, remedy, path)
 
-    def _check_values(self, mission: Mission) -> None:
+    def _check_added_keys(self, mission: Mission) -> None:
         """Check that the mission accepts values for the keys that it does not have, all of them together."""
         document = mission.to_dict()
         for _, column in self.lacked:

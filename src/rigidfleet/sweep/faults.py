@@ -63,10 +63,10 @@ class Drill(Part):
     trials: AgentNumber = key("trials of each magnitude: other vehicles, directions, times", 20)
     files: tuple[str, ...] = key("files of others that are flown, not those of the mission", ())
 
-    def grids(self, n: int) -> list[Variation]:
+    def case_grids(self, n: int) -> list[Variation]:
         """The cases of a show of n vehicles as three grids that go together: a drill is a sweep over them."""
         possible = PARTIAL | SETUP if self.files else UNITS
-        faults, most = self.model_fields_set & UNITS.keys() or possible.keys(), greatest_sizes(n)
+        faults, most = self.model_fields_set & UNITS.keys() or possible.keys(), fault_sizes(n)
         some = sorted({min(count, n) for count in self.vehicles})
         counts = dict.fromkeys(PARTIAL, some) | dict.fromkeys(SETUP, sorted({1, n}))
         places = range(1, len(self.stale) + 1)
@@ -83,13 +83,13 @@ class Drill(Part):
         return [Grid(path=name, kind="grid", values=x, group="drill") for name, x in columns]
 
     @property
-    def digest(self) -> str:
+    def files_digest(self) -> str:
         """A digest of all files that it names; "" if it names none."""
         named = [*map(Path, self.files + self.stale)]
         paths = sorted(p for path in named for p in (path, *path.rglob("*")) if p.is_file())
         return hashlib.sha256(b"".join(p.read_bytes() for p in paths)).hexdigest() if paths else ""
 
-    def from_folder(self, folder: Path) -> Drill:
+    def with_files_in_folder(self, folder: Path) -> Drill:
         """The same, with files as seen from a folder; names of shipped missions stay."""
 
         def resolve_file(name: str) -> str:
@@ -99,7 +99,7 @@ class Drill(Part):
         return self.model_copy(update={key: x for key, x in named.items() if x})
 
 
-def greatest_sizes(n: int) -> dict[str, int]:
+def fault_sizes(n: int) -> dict[str, int]:
     """Of how many vehicles or links at most a key may be in a show of n vehicles."""
     return {"vehicles": n, "another": n - 1, "lost": n - 1, "links": n * (n - 1) // 2}
 
@@ -260,9 +260,9 @@ class Show:
                 " version of the same show."
             )
         result = simulate(mission)
-        motion = result.motion(flown=False)
+        motion = result.setpoints_at_samples(flown=False)
         if not np.isfinite(motion.state).all():  # where no slots are tracked, vehicles have no file
-            motion = result.motion(flown=True)
+            motion = result.setpoints_at_samples(flown=True)
         return ways_of(motion, slice(None)), NAMES[7], assess(result), ()
 
     def measure_fault(self, fault: GeometricFault) -> tuple[dict[str, float | None], str, str]:

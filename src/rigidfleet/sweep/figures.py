@@ -91,12 +91,12 @@ def plot(
     draw: dict[str, Callable[[Table], Figure | None]] = {
         "histograms": histograms,
         "envelopes": envelopes,
-        "outcome": outcome,
+        "outcome": success_figure,
         "drivers": correlations,
         "map": partial(map_over_two, over=over, metric=metric),
     }
     if table.sweep.drill is not None:
-        draw = {"drill": shares, "worst": worst_runs}
+        draw = {"drill": failure_share_figure, "worst": worst_runs}
     files = []
     for name, drawn in draw.items():
         with st.apply_style(), st.figure_options(titles=titles):
@@ -106,7 +106,7 @@ def plot(
     return files
 
 
-def outcome(table: Table) -> Figure | None:
+def success_figure(table: Table) -> Figure | None:
     """Success rate over the number of runs, with its confidence interval, and the failures of each check."""
     if not len(table.run):
         return None
@@ -141,7 +141,7 @@ def outcome(table: Table) -> Figure | None:
     return fig
 
 
-def shares(table: Table) -> Figure | None:
+def failure_share_figure(table: Table) -> Figure | None:
     """Share of the runs of a drill that fail, over the magnitudes of each fault."""
     cases = fault_rates(table)
     if not cases:
@@ -362,7 +362,7 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
     look: dict[str, Any] = {"vmin": 0, "vmax": 100} if metric == "success" else {}
     look |= {"norm": "log"} if wide else {}
     image = ax.pcolormesh(x, y, cells, cmap="viridis", edgecolor="white", linewidth=0.4, **look)
-    unit = "passed [%]" if metric == "success" else f"{METRICS[metric].text} [{_unit(metric)}]"
+    unit = "passed [%]" if metric == "success" else f"{METRICS[metric].text} [{_unit_of(metric)}]"
     fig.colorbar(image, ax=ax, label=unit, pad=0.02)
     ax.grid(visible=False)
     ax.set(xlabel=_axis_label(table, over[0]), ylabel=_axis_label(table, over[1]))
@@ -416,10 +416,10 @@ def _draw_run_legend(fig: Figure, table: Table, *, limit: bool = False) -> None:
 
 
 def _metric_label(metric: str) -> str:
-    return f"{metric.replace('_', ' ')} [{_unit(metric)}]"
+    return f"{metric.replace('_', ' ')} [{_unit_of(metric)}]"
 
 
-def _unit(metric: str) -> str:
+def _unit_of(metric: str) -> str:
     return readable_unit(METRICS[metric].unit)
 
 

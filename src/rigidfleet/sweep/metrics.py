@@ -90,7 +90,7 @@ def measure_metrics(result: Result, verdict: Verdict) -> dict[str, float]:
         "steps": float(result.statistics["steps"]),
         "evaluations": float(result.statistics["evaluations"]),
     }
-    values |= _flight_errors(result)
+    values |= _shape_and_tracking_errors(result)
     for name in ("position", "velocity", "attitude", "rates"):
         misses = (getattr(w, name) for p in phases for w in (p.waypoint, p.stay) if w)
         values[f"waypoint_{name}"] = _greatest_known(misses)
@@ -109,9 +109,9 @@ def _greatest_known(values: Iterable[float | None]) -> float:
     return max((v for v in values if v is not None), default=math.nan)
 
 
-def _flight_errors(result: Result) -> dict[str, float]:
+def _shape_and_tracking_errors(result: Result) -> dict[str, float]:
     """Errors of shape and of tracking at all samples, lost vehicles left out."""
-    off = np.ascontiguousarray((_positions_left(result) - result.slot_position).T)
+    off = np.ascontiguousarray((_flying_positions(result) - result.slot_position).T)
     apart, shape = _greatest_of_columns(proximity.root_of_squares(off)), shape_errors(result)
     tracked = np.isfinite(apart)
     errors = {
@@ -139,13 +139,14 @@ def shape_errors(result: Result) -> Floats:
         return error
     pairs = proximity.all_pairs(n).T
     flown, due = (
-        proximity.lengths(x, pairs) for x in (_positions_left(result), result.slot_position)
+        proximity.pair_distances(x, pairs)
+        for x in (_flying_positions(result), result.slot_position)
     )
     flown -= due
     return np.fmax(error, _greatest_of_columns(np.abs(flown, out=flown)))
 
 
-def _positions_left(result: Result) -> Floats:
+def _flying_positions(result: Result) -> Floats:
     """Positions (K, N, 3) [m]; NaN of agents that are lost."""
     left = result.left
     return result.position if left.all() else np.where(left[..., None], result.position, np.nan)

@@ -49,7 +49,7 @@ def _record_fault(sweep: Sweep, run: int) -> RunRecord:
     show, fault = _show_and_fault(sweep, run)
     begun = perf_counter()
     outcome = _value_or_error(lambda: show.measure_fault(fault))
-    return _record(sweep, run, sweep.values(run), outcome, begun)
+    return _run_row(sweep, run, sweep.values(run), outcome, begun)
 
 
 def _show_and_fault(sweep: Sweep, run: int) -> tuple[faults.Show, faults.GeometricFault]:
@@ -100,7 +100,7 @@ def _fly_group(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
         begun, flight = perf_counter() - shared, flown.pop(run)
         if isinstance(flight, Mission):
             flight = _value_or_error(lambda mission=flight: fly_mission(mission))
-        rows.append(_record(sweep, run, values[run], flight, begun))
+        rows.append(_run_row(sweep, run, values[run], flight, begun))
         del flight
     return rows
 
@@ -115,7 +115,7 @@ def _value_or_error(job: Callable[[], Any]) -> Any:
         return error
 
 
-def _record(sweep: Sweep, run: int, values: Sequence[Any], flown: Any, begun: float) -> RunRecord:
+def _run_row(sweep: Sweep, run: int, values: Sequence[Any], flown: Any, begun: float) -> RunRecord:
     """Judge and measure a flight, unless it is the outcome; ``begun``: when, by `perf_counter` [s]."""
     codes = tuple(c.variation.encode(v) for c, v in zip(sweep.columns, values, strict=True))
     metrics = dict.fromkeys(METRICS, math.nan)
@@ -124,7 +124,7 @@ def _record(sweep: Sweep, run: int, values: Sequence[Any], flown: Any, begun: fl
     match outcome:
         case MissionError():
             reason, detail = refusal_reason(outcome)
-        case FlightError() if sweep.header.own_law[1]:
+        case FlightError() if sweep.header.law_key_and_name[1]:
             reason, detail = RAISED, str(outcome)
         case Exception():
             reason, detail = BROKEN, f"{type(outcome).__name__}: {outcome}"

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.processes import cores
+from rigidfleet._common.processes import usable_core_count
 from rigidfleet.errors import RigidfleetError, wrong_type
 from rigidfleet.sweep import workers as pools
 from rigidfleet.sweep.definition import Sweep
@@ -104,23 +104,23 @@ def fly(
     if not isinstance(pool, Executor | None):
         raise wrong_type("an Executor of concurrent.futures as pool", pool)
     own, folder = runs_of_shard(shard, sweep.runs), shard_folder(Path(folder), shard)
-    count = cores() if workers is None else workers
+    count = usable_core_count() if workers is None else workers
     with Store(folder, sweep, shard, replace) as store:
         flight = _Sweeping(sweep, store, progress, own)
         if cluster is not None:
             with pools.open_cluster(cluster) as (executor, capacity):
-                flight.hand_out(executor, capacity)
+                flight.fly_by_executor(executor, capacity)
         elif pool is not None:
-            flight.hand_out(pool, lambda: count)
+            flight.fly_by_executor(pool, lambda: count)
         else:
-            flight.fly_alone(until_worth=count > 1)
+            flight.fly_in_this_process(until_worth=count > 1)
             deaths = 0
             while flight.missing:
                 before = flight.flown
                 flight.report_progress(count)
                 try:
                     with pools.start_processes(count) as executor:
-                        flight.hand_out(executor, lambda: count)
+                        flight.fly_by_executor(executor, lambda: count)
                 except RigidfleetError as error:
                     if not isinstance(error.__cause__, BrokenExecutor):
                         raise
@@ -149,7 +149,7 @@ class _Sweeping:
         _log.info(f"{self.words()}; begun")
         self.report_progress(1)
 
-    def fly_alone(self, *, until_worth: bool) -> None:
+    def fly_in_this_process(self, *, until_worth: bool) -> None:
         """Fly in this process: all runs, or until the remaining work justifies more processes."""
         while self.missing:
             if until_worth and self.pace * GROUP * len(self.missing) > WORTH:
@@ -157,7 +157,7 @@ class _Sweeping:
             self.store_records(fly_runs(self.sweep, self.take_chunk(1)))
             self.report_progress(1)
 
-    def hand_out(self, executor: Executor, capacity: Callable[[], int]) -> None:
+    def fly_by_executor(self, executor: Executor, capacity: Callable[[], int]) -> None:
         """Fly all missing runs by an executor with a number of workers. Runs that do not come back are missing again.
 
         Raises

@@ -177,7 +177,7 @@ class Summary(Shown):
             parts.append(Line(words, "ok" if s.count == s.of else "note"))
         return Sheet(self.name, f"{self.flown} of {self.runs} runs", parts)
 
-    def rehearsals(self) -> list[str]:
+    def drill_sentences(self) -> list[str]:
         """What a drill has shown, first of all faults, then of each, in a sentence: for the first page of a report."""
         lines = [f"{self.success.count:,} of {self.flown:,} faults are harmless."]
         if more := self.runs - self.flown:
@@ -242,7 +242,7 @@ def summarise(table: store.Table) -> Summary:
             percentiles[name] = np.percentile(finite, PERCENTILES).tolist()
     by_value = {}
     for k, column in enumerate(table.sweep.columns):
-        if column.in_words:
+        if column.has_non_numbers:
             words = np.array([str(column.variation.decode(x)) for x in table.codes[:, k].tolist()])
             by_value[column.name] = {
                 word: pass_rate(table.passed[words == word])
@@ -262,7 +262,7 @@ def summarise(table: store.Table) -> Summary:
         percentiles,
         correlations_by_strength(table),
         by_value,
-        numbers if sweep.random else "none",
+        numbers if sweep.has_random_numbers else "none",
         table.levels,
         fault_rates(table),
     )
@@ -328,7 +328,7 @@ def outcomes(table: store.Table) -> dict[str, Floats]:
     return {
         name: values
         for name, values in all_outcomes.items()
-        if _differs(values, _SPREAD, _NOISE) and name not in ASIDE
+        if _has_spread(values, _SPREAD, _NOISE) and name not in ASIDE
     }
 
 
@@ -337,7 +337,7 @@ def varied_numbers(table: store.Table) -> dict[str, Floats]:
     return {
         column.name: table.codes[:, k]
         for k, column in enumerate(table.sweep.columns)
-        if column.in_order and _differs(table.codes[:, k])
+        if column.has_order and _has_spread(table.codes[:, k])
     }
 
 
@@ -355,7 +355,7 @@ def correlations_by_strength(table: store.Table) -> list[Driver]:
         every = n == len(y)
         y_ranked = _centred_ranks(y[there])
         for name, x in numbers.items():
-            if every or _differs(x[there]):
+            if every or _has_spread(x[there]):
                 x_ranked = ranked[name] if every else _centred_ranks(x[there])
                 tested.append((name, outcome, *_rank_correlation(x_ranked, y_ranked)))
     adjusted = _adjusted_p_values(np.array([chance for *_, chance in tested]))
@@ -393,7 +393,7 @@ def _rank_correlation(x: Floats, y: Floats) -> tuple[float, float]:
     return r, max(float(2.0 * stdtr(free, -t)), least)
 
 
-def _differs(values: Floats, relative: float = 0.0, absolute: float = 0.0) -> bool:
+def _has_spread(values: Floats, relative: float = 0.0, absolute: float = 0.0) -> bool:
     finite = values[np.isfinite(values)]
     least = max(absolute, relative * np.abs(finite).max(initial=0.0))
     return len(finite) > 1 and bool(np.ptp(finite) > least)

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from multiprocessing import connection
 from typing import Any
 
-from rigidfleet._common.processes import keep_folder_off_path
+from rigidfleet._common.processes import set_python_safe_path
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep.definition import sweep_of_json
 from rigidfleet.sweep.record import RunRecord
@@ -53,7 +53,7 @@ def start_processes(count: int) -> Generator[Executor]:
     context = multiprocessing.get_context("fork" if forked else "spawn")
     # Before a spawned process receives the module path of its parent, it would search the current folder first, even
     # for modules of the standard library; so would multiprocessing's resource tracker.
-    with keep_folder_off_path():
+    with set_python_safe_path():
         pool = ProcessPoolExecutor(count, context, _begin_worker)
         try:
             if forked:  # all forks begin at once, and Ctrl-C waits from their start

@@ -76,7 +76,7 @@ class GainSpace:
         return gains
 
     @property
-    def own_point(self) -> Floats:
+    def mission_point(self) -> Floats:
         """The point (D,) of the mission's own gains."""
         return np.array(
             [math.log(self.own[p] / a) / math.log(b / a) for p, (a, b) in self.ends.items()]
@@ -116,7 +116,7 @@ class Screen:
             laws += [] if tracking is None else [(TRACKING, tracking)]
             looped, _ = formation_closed_loops(mission, preview_phases(mission)[0], lags)
             laws += [(CONSTRAINT, law) for law in looped]
-        self.parts = _distinct_parts(laws)
+        self.parts = _distinct_loop_parts(laws)
         self.own = self.margins_by_law(self.gains)
 
     def margins_by_law(self, gains: Gains) -> dict[str, Margins]:
@@ -154,7 +154,7 @@ class Screen:
             yield part.name, stability_margins([part.loop], replace(part.law, **new), part.growth)
 
 
-def _distinct_parts(laws: Sequence[tuple[str, ClosedLoops]]) -> list[_Part]:
+def _distinct_loop_parts(laws: Sequence[tuple[str, ClosedLoops]]) -> list[_Part]:
     """The distinct parts of all loops: most shapes have the same, and what decays on the longest way counts."""
     parts: dict[object, _Part] = {}
     for name, looped in laws:
@@ -183,7 +183,7 @@ def feasible_points(
 
     Where margins refuse `_TRIES` points in a row, the next one is drawn towards the mission's own gains.
     """
-    start = space.own_point
+    start = space.mission_point
     points = [start]
     while len(points) < count:
         for _ in range(_TRIES):

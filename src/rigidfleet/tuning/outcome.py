@@ -12,6 +12,7 @@ import numpy as np
 
 from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.plain import to_json_data
+from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet.math.margins import Margins
 from rigidfleet.sweep.record import reason_in_words
 from rigidfleet.tuning.gains import Gains
@@ -57,6 +58,7 @@ class Flown:
         }  # fmt: skip
 
 
+@with_earlier_names(rows="table_rows")
 @dataclass
 class Tuned(Shown):
     """Result of a study; print it to see both sides.
@@ -95,7 +97,7 @@ class Tuned(Shown):
         return 1.0 - after.mean(self.metric) / before.mean(self.metric)
 
     @property
-    def worse(self) -> bool:
+    def is_worse(self) -> bool:
         """Whether the best gains of the search are no better on new seeds, so that the mission keeps its own."""
         if self.validation is None:
             return False
@@ -114,7 +116,7 @@ class Tuned(Shown):
             return f"{words}: unknown, because some flights did not reach their end."
         where = "on new seeds" if self.validation else "in the flights of the search"
         side = "smaller" if self.improvement >= 0 else "larger"
-        kept = "; the mission keeps its own gains" if self.worse else ""
+        kept = "; the mission keeps its own gains" if self.is_worse else ""
         return f"{words}: {100 * abs(self.improvement):.0f} % {side} {where}{kept}."
 
     def to_dict(self) -> dict[str, Any]:
@@ -145,12 +147,12 @@ class Tuned(Shown):
 
     def facts(self) -> Sheet:
         """Gains, errors and margins on both sides, and the conclusion."""
-        table = FactTable(("", "before", "after", "change"), [*map(Row, self.rows())])
+        table = FactTable(("", "before", "after", "change"), [*map(Row, self.table_rows())])
         flights = f"{self.flights} flights of {self.candidates} choice{'s' * (self.candidates != 1)} of gains"
         title = f"{flights}; {self.refused} refused for their margins"
         return Sheet(self.mission, title, [table, Line(self.conclusion)])
 
-    def rows(self) -> list[tuple[str, str, str, str]]:
+    def table_rows(self) -> list[tuple[str, str, str, str]]:
         """Rows of the table: what, before, after, change."""
         rows = [
             (path, f"{gain:.4g}", f"{self.after.gains[path]:.4g}", "")

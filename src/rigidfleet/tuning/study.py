@@ -24,7 +24,7 @@ import numpy as np
 
 from rigidfleet._common.arguments import as_path
 from rigidfleet._common.files import make_folder, write_file
-from rigidfleet._common.processes import cores
+from rigidfleet._common.processes import usable_core_count
 from rigidfleet._version import __version__
 from rigidfleet.errors import ResultError, RigidfleetError
 from rigidfleet.mission import Mission
@@ -125,12 +125,12 @@ def tune(
         folder, {"version": __version__, "mission": flown.text, **options}, own_mission.name
     )
     claim.begin_study(replace=replace)
-    count = cores() if workers is None else workers
+    count = usable_core_count() if workers is None else workers
     study = _Study(flown, folder, options, paths, budget, count, progress)
     with study.stack:
         tuned = study.search(range(seed, seed + seeds))
         study.validate(tuned, range(seed + seeds, seed + seeds + validation))
-        chosen = tuned.before if tuned.worse else tuned.after
+        chosen = tuned.before if tuned.is_worse else tuned.after
         tuned.text = with_gains(own_mission.text, chosen.gains)
     claim.write(tuned)
     return tuned

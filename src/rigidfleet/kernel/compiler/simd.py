@@ -76,15 +76,15 @@ class LaneArray(np.ndarray):
     """An array of `lanes`, made by `pack` and read by `unpack`."""
 
 
-def pack(values: Floats) -> LaneArray:
+def pack_lanes(values: Floats) -> LaneArray:
     """An array (...) of lanes from float64 (..., 8): a copy, aligned for vectors."""
     values = np.asarray(values, dtype=np.float64)
-    packed = empty(values.shape[:-1])
+    packed = empty_lanes(values.shape[:-1])
     unpack(packed)[...] = values
     return packed
 
 
-def empty(shape: tuple[int, ...]) -> LaneArray:
+def empty_lanes(shape: tuple[int, ...]) -> LaneArray:
     """An array of lanes with any numbers, aligned for vectors."""
     size = WIDTH * math.prod(shape)
     memory = np.empty(size + WIDTH)

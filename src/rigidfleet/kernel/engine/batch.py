@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.arrays import arrays_equal
+from rigidfleet._common.renamed import getattr_of_earlier_names
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.compiler.pointers import address_of
-from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, empty, pack, unpack
+from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, empty_lanes, pack_lanes, unpack
 from rigidfleet.kernel.engine import lane_steps, native
 from rigidfleet.kernel.engine.codegen import (
     addresses,
+    gust_and_noise_tables,
     integrate,
     packed,
-    tables_of,
     unrolled,
     unrolled_together,
 )
@@ -106,7 +107,7 @@ class FinalStates:
     evaluations: Ints
 
 
-def fits(problem: Problem) -> bool:
+def can_unroll(problem: Problem) -> bool:
     """Return whether straight-line code can be generated for a problem, and is worthwhile.
 
     Its branches must not depend on the state, and its code must not be too long to be compiled.
@@ -126,7 +127,7 @@ def _count_equations(problem: Problem) -> int:
     return min(edges, 3 * agents) if problem.law.solver == ITERATED else edges
 
 
-def fit_together(problems: Sequence[Problem]) -> bool:
+def can_unroll_together(problems: Sequence[Problem]) -> bool:
     """Return whether problems differ in nothing but numbers and tables over time, and suit straight-line code.
 
     They must have the same graph, laws, blend and knots, no branch that depends on the state, and no longest step.
@@ -175,7 +176,7 @@ class Vector:
     """
 
     def __init__(self, disturbances: Sequence[Disturbance]) -> None:
-        self._tables = tables_of(disturbances)
+        self._tables = gust_and_noise_tables(disturbances)
 
     def begin(
         self,
@@ -189,7 +190,7 @@ class Vector:
 
         Parameters
         ----------
-        problems : of eight flights, which `fit_together`
+        problems : of eight flights, which `can_unroll_together`
         states : of their integrators, at one time; their trails have the same number of rows
         times, samples : times (K,) [s] to record, and an array (K, n) for each flight
 
@@ -204,9 +205,9 @@ class Vector:
         n, (rows, forces) = len(first.y), first.trail.gauge.shape
         trails = [addresses([getattr(x.trail, name) for x in states]) for name in lane_steps.TRAIL]
         self._problem = ready._replace(
-            samples=addresses(samples), trails=np.array(trails), halves=empty((2, 5, n))
+            samples=addresses(samples), trails=np.array(trails), halves=empty_lanes((2, 5, n))
         )
-        K = empty((lane_steps.ROWS, n))
+        K = empty_lanes((lane_steps.ROWS, n))
         unpack(K)[: lane_steps.STAGES] = 0.0
         unpack(K)[lane_steps.ATOL] = np.stack([state.K[ATOL, :n] for state in states], axis=-1)
         clock = np.array([first.clock[TIME], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
@@ -233,7 +234,7 @@ class Vector:
         return int(status)
 
 
-_UNSAMPLED = pack(np.zeros((0, 1, WIDTH)))
+_UNSAMPLED = pack_lanes(np.zeros((0, 1, WIDTH)))
 
 
 def fly_all(
@@ -269,13 +270,13 @@ def fly_all(
         The problem does not fit vectors, see `fits`.
     """
 
-    def begin_alone() -> Callable[..., None]:
+    def make_single_worker() -> Callable[..., None]:
         d0 = problem.reference.d0.copy()
         own = problem._replace(reference=problem.reference._replace(d0=d0))
         w = workspace(len(problem.vehicles.m), len(d0), solver=problem.law.solver)
         unsampled = np.zeros(0), np.zeros((0, starts.shape[1]))
 
-        def work(
+        def fly_one_by_one(
             starts: Floats, before: Floats, ends: Floats, status: Ints, evaluations: Ints
         ) -> None:
             for k, start in enumerate(starts):
@@ -285,11 +286,11 @@ def fly_all(
                 status[k] = integration(True, max_steps)
                 ends[k], evaluations[k] = state.y, state.count[EVALUATIONS]
 
-        return work
+        return fly_one_by_one
 
     if not vectors:
-        return _fly_in_threads(begin_alone, starts, before, threads)
-    if not fits(problem):
+        return _fly_in_threads(make_single_worker, starts, before, threads)
+    if not can_unroll(problem):
         raise ValueError("flights of this problem cannot share vectors; use vectors=False")
     count, n = starts.shape
     ready = unrolled(problem)
@@ -297,19 +298,19 @@ def fly_all(
     def in_lanes(x: Floats) -> LaneArray:
         if count % WIDTH:  # unused lanes of the last vector repeat the last flight
             x = x[np.minimum(np.arange(padded(count)), count - 1)]
-        return pack(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
+        return pack_lanes(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
 
     def make_worker() -> Callable[..., None]:
         K = np.zeros((lane_steps.ROWS, n, WIDTH))
         K[lane_steps.ATOL] = atol[:, None]
         y, clock, counts = (
-            pack(np.zeros((n, WIDTH))),
+            pack_lanes(np.zeros((n, WIDTH))),
             np.zeros(3),
             np.zeros(FIRST_ROW + 1, dtype=np.int64),
         )
-        state = IntegratorState(y, pack(K), clock, counts, rtol, NO_TRAIL)
+        state = IntegratorState(y, pack_lanes(K), clock, counts, rtol, NO_TRAIL)
         own = ready._replace(
-            before=empty(ready.before.shape), known=empty(ready.known.shape), time=ready.time.copy(),
+            before=empty_lanes(ready.before.shape), known=empty_lanes(ready.known.shape), time=ready.time.copy(),
             stage=ready.stage.copy(),
         )  # fmt: skip
 
@@ -324,7 +325,7 @@ def fly_all(
     evaluations = np.repeat(ends.evaluations, WIDTH)[:count]
     lost = ~finished
     if lost.any():
-        again = _fly_in_threads(begin_alone, starts[lost], before[lost], threads)
+        again = _fly_in_threads(make_single_worker, starts[lost], before[lost], threads)
         y[lost], finished[lost], evaluations[lost] = again.y, again.finished, again.evaluations
     return FinalStates(y, finished, evaluations)
 
@@ -352,3 +353,8 @@ def _fly_in_threads(
         for job in jobs:
             job.result()
     return FinalStates(ends, status == FINISHED, evaluations)
+
+
+__getattr__ = getattr_of_earlier_names(
+    __name__, fit_together="can_unroll_together", fits="can_unroll"
+)

@@ -58,11 +58,11 @@ _RETURNING = {"solve", "count_blocks", "factor", "inner", "conjugate_gradients"}
 _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
 
-def flight_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]:
+def flight_object_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]:
     """Object code of the C functions of the first library.
 
     Their arguments are addresses of named tuples. They integrate (and return what `dopri5.integrate` returns),
-    record, and monitor. The ``second`` process, if there is one, makes what is `monitor_code`.
+    record, and monitor. The ``second`` process, if there is one, makes what is `monitor_object_code`.
     """
 
     def integrate_segment(p, w, state, call):
@@ -76,32 +76,32 @@ def flight_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]:
 
     keep_extents()
     integrated, recorded = (IntegratorState, Segment), (Segment, Record)
-    integration = _module(integrate_segment, Problem, Workspace, *integrated, result=types.int64)
-    recording = _module(record_segment, Problem, Workspace, *recorded, result=types.int64)
+    integration = _ir_text(integrate_segment, Problem, Workspace, *integrated, result=types.int64)
+    recording = _ir_text(record_segment, Problem, Workspace, *recorded, result=types.int64)
     codes = [
         _object_code(*integration, "integrate"),
         _object_code(*integration, "integrate_three", sizes=THREE),
         _object_code(*recording, "record"),
     ]
     made = None if second is None else objects.split_objects(second.communicate()[0])
-    return [*codes, *(made or monitor_code())]
+    return [*codes, *(made or monitor_object_code())]
 
 
-def monitor_code() -> list[bytes]:
+def monitor_object_code() -> list[bytes]:
     """Object codes of monitor, measurement, clearances and recursions, which share little with the rest."""
     watched, word = (Problem, IntegratorState, Monitor), types.int64
     with_law = Problem, Workspace, IntegratorState, Monitor
     calls = (
-        ("bound_moves", lambda p, s, m: monitor.bound_changes(p, s, m), *watched),
+        ("bound_moves", lambda p, s, m: monitor.bound_distance_changes(p, s, m), *watched),
         ("watch_distances", lambda i, j, p, s, m: monitor.watch_distances(i, j, p, s, m), word, word, *watched),
         ("watch_forces", lambda last, p, w, s, m: monitor.watch_forces(last, p, w, s, m), word, *with_law),
         ("measure", lambda m: measurement.measure_samples(m), Measured),
         ("follow", lambda s: recursion.run_linear_recursion(s), Recursion),
     )  # fmt: skip
-    return [_object_code(*_module(*call), name) for name, *call in calls]
+    return [_object_code(*_ir_text(*call), name) for name, *call in calls]
 
 
-def sampled_code() -> list[bytes]:
+def sampled_object_code() -> list[bytes]:
     """Object code of sampled flights."""
     from rigidfleet.kernel import sampled_flight
 
@@ -109,25 +109,25 @@ def sampled_code() -> list[bytes]:
         return sampled_flight.fly_ticks(p, w, flight, state, call)
 
     kinds = Problem, Workspace, fleet.SampledFlight, fleet.SampledState, fleet.SampledSegment
-    module = _module(fly, *kinds, result=types.int64)
+    module = _ir_text(fly, *kinds, result=types.int64)
     return [_object_code(*module, "fly_ticks", hot=_HOT_SAMPLED)]
 
 
-def avoidance_code() -> list[bytes]:
+def avoidance_object_code() -> list[bytes]:
     """Object code of avoidance in flight."""
     from rigidfleet.kernel import guard
 
-    problem, workspace = (pointer_to(_type_of(kind)) for kind in (Problem, Workspace))
+    problem, workspace = (pointer_to(_numba_type_of(kind)) for kind in (Problem, Workspace))
 
     def avoid(f, s, a, _):
         return guard.guard_forces(problem(a.law[0]), workspace(a.law[1]), f, s, a)
 
     word = types.int64
     kinds = fleet.SampledFlight, fleet.SampledState, AvoidanceArrays, word
-    return [_object_code(*_module(avoid, *kinds, result=word), "avoid", hot=())]
+    return [_object_code(*_ir_text(avoid, *kinds, result=word), "avoid", hot=())]
 
 
-def solids_code() -> list[bytes]:
+def solids_object_code() -> list[bytes]:
     """Object code of the monitor of obstacles that move or are no plain boxes."""
     from rigidfleet.kernel.obstacles import watch_step
 
@@ -139,10 +139,10 @@ def solids_code() -> list[bytes]:
             watch_step(trail.points[row], trail.clock[row, 0], trail.clock[row, 1], p, s, watch)
 
     kinds = types.int64, types.int64, Problem, IntegratorState, Monitor, Solids
-    return [_object_code(*_module(watch_solids, *kinds), "watch_solids", hot=())]
+    return [_object_code(*_ir_text(watch_solids, *kinds), "watch_solids", hot=())]
 
 
-def large_code() -> list[bytes]:
+def large_solver_object_code() -> list[bytes]:
     """Object code of the functions of the solver of large formations."""
     codes = []
     for name, kind in packing.OF_LARGE.items():
@@ -152,29 +152,29 @@ def large_code() -> list[bytes]:
         call = f"return 0.0 + f({fields})" if source in _RETURNING else f"f({fields}); return 0.0"
         scope = {"f": function}
         exec(f"def entry(x):\n    {call}", scope)
-        module = _module(scope["entry"], kind, result=types.float64)
+        module = _ir_text(scope["entry"], kind, result=types.float64)
         codes.append(_object_code(*module, name, hot=()))
     return codes
 
 
 #: The makers of the libraries beside the first, and of the part that a second process makes of that.
 LIBRARIES = {
-    "sampled": sampled_code,
-    "avoidance": avoidance_code,
-    "solids": solids_code,
-    "large": large_code,
-    "apart": monitor_code,
+    "sampled": sampled_object_code,
+    "avoidance": avoidance_object_code,
+    "solids": solids_object_code,
+    "large": large_solver_object_code,
+    "apart": monitor_object_code,
 }
 
 
-def _type_of(kind: type) -> Any:
+def _numba_type_of(kind: type) -> Any:
     """The type, for the compiler, of a type of named tuples."""
     return typeof(packing.example_of(kind))
 
 
-def _module(function: Any, *arguments: Any, result: Any = types.void) -> tuple[str, str]:
+def _ir_text(function: Any, *arguments: Any, result: Any = types.void) -> tuple[str, str]:
     """The module of a C function of words and of addresses of named tuples of these types, and its symbol."""
-    kinds = [x if x is types.int64 else Pointer(_type_of(x)) for x in arguments]
+    kinds = [x if x is types.int64 else Pointer(_numba_type_of(x)) for x in arguments]
     made = cfunc(result(*kinds), **OPTIONS)(function)
     return made.inspect_llvm(), made.native_name
 
@@ -233,5 +233,5 @@ def main(part: str) -> None:
         second = subprocess.Popen(
             objects.build_command("apart"), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
         )
-        codes = flight_code(second)
+        codes = flight_object_code(second)
     sys.stdout.buffer.write(objects.join_objects(codes))

@@ -31,9 +31,9 @@ from rigidfleet.kernel.engine.tracer import (
     FlightTrace,
     Symbol,
     Trace,
-    flight_structure,
-    numbers,
-    structure,
+    code_structure,
+    flight_code_structure,
+    varying_numbers,
 )
 from rigidfleet.kernel.problem import Disturbance, Problem
 from rigidfleet.kernel.references import piece_at, septic
@@ -78,26 +78,28 @@ def unrolled(problem: Problem) -> UnrolledProblem:
     UnfitError
         The problem has branches that depend on the state.
     """
-    description, values, _ = structure(problem)
+    description, values, _ = code_structure(problem)
     return _prepare_unrolled(problem, description, values[:, None], lambda: Trace(problem))
 
 
 def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> UnrolledProblem:
-    """Prepare eight problems, which `batch.fit_together`, of one flight each; with their `tables_of` gusts and noise.
+    """Prepare eight problems, which `batch.can_unroll_together`, of one flight each.
+
+    Their gusts and noise are in ``tables`` (`gust_and_noise_tables`).
 
     Raises
     ------
     UnfitError
         The problems have branches that depend on the state, or take different ones.
     """
-    first, values = problems[0], numbers(problems)
+    first, values = problems[0], varying_numbers(problems)
     turns = values[TURN].any(axis=0)
     if turns.any():  # slots that do not turn, where others do
         values[TURN, ~turns] = _BARELY
     motion = packed([p.motion.coefficients.reshape(-1, 36) for p in problems])
     sizes = np.abs(unpack(motion)).reshape(-1, 6, 6 * WIDTH).max(axis=(0, 2))
     moves = (sizes > _STILL).tolist()
-    description = flight_structure(first, values, moves)
+    description = flight_code_structure(first, values, moves)
     ready = _prepare_unrolled(first, description, values, lambda: FlightTrace(first, values, moves))
     return ready._replace(
         before=packed([p.reference.d0 for p in problems]), knots=first.motion.knots, motion=motion,
@@ -112,7 +114,7 @@ _BARELY = np.array([[0.0], [0.0], [1e-150]])
 _STILL = 1e-30
 
 
-def tables_of(disturbances: Sequence[Disturbance]) -> dict[str, Any]:
+def gust_and_noise_tables(disturbances: Sequence[Disturbance]) -> dict[str, Any]:
     """Fields of an `UnrolledProblem` with the gusts and the noise of eight flights."""
     first = disturbances[0]
     tables = {
@@ -127,7 +129,7 @@ def tables_of(disturbances: Sequence[Disturbance]) -> dict[str, Any]:
 
 def packed(parts: Sequence[Floats]) -> LaneArray:
     """Lanes (...) of eight arrays of one shape (...)."""
-    return simd.pack(np.stack(parts, axis=-1))
+    return simd.pack_lanes(np.stack(parts, axis=-1))
 
 
 def addresses(arrays: Sequence[Floats]) -> Ints:
@@ -144,17 +146,17 @@ def _prepare_unrolled(
         _KNOWN[name] = code, _compile(code, name), _compile_flight_constants(code, name)
     code, address, before = _KNOWN[name]
     uniform, distinct = (
-        simd.empty((len(code.inputs),)),
-        simd.pack(np.broadcast_to(values, (len(values), WIDTH))),
+        simd.empty_lanes((len(code.inputs),)),
+        simd.pack_lanes(np.broadcast_to(values, (len(values), WIDTH))),
     )
     before(distinct.ctypes.data, uniform.ctypes.data)
-    reference, none = problem.reference, simd.empty((0, 1))
-    lanes = lambda count: simd.empty((count,))  # noqa: E731
+    reference, none = problem.reference, simd.empty_lanes((0, 1))
+    lanes = lambda count: simd.empty_lanes((count,))  # noqa: E731
     return UnrolledProblem(
         address, uniform, lanes(len(problem.graph.edges)), np.zeros(MOMENT + 1), lanes(len(code.known)),
         lanes(len(code.gauge)), np.zeros(1, dtype=np.int64), reference.t0, reference.T_b, np.zeros(0), none,
         1.0, 0, none, 1.0, 0, none, none, np.zeros(WIDTH, dtype=np.int64),
-        np.zeros((len(lane_steps.TRAIL), WIDTH), dtype=np.int64), simd.empty((2, 5, 0)),
+        np.zeros((len(lane_steps.TRAIL), WIDTH), dtype=np.int64), simd.empty_lanes((2, 5, 0)),
     )  # fmt: skip
 
 
@@ -217,7 +219,9 @@ integrate = compiled_copy(
     dopri5.integrate,
     "integrate_straight",
     closed_loop=_closed_loop,
-    keep_step=compiled_copy(lane_steps.keep_step, "keep_step_straight", closed_loop=_closed_loop),
+    record_step=compiled_copy(
+        lane_steps.record_step, "keep_step_straight", closed_loop=_closed_loop
+    ),
     **lane_steps.INSTEAD,
 )
 
@@ -239,7 +243,7 @@ def _compile(code: Code, name: str) -> int:
     """Compile straight-line code, or find it compiled on disk; return its address."""
 
     @intrinsic
-    def lines(
+    def straight_line_intrinsic(
         _context, y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted
     ):
         def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
@@ -250,24 +254,24 @@ def _compile(code: Code, name: str) -> int:
         return types.void(*kinds), generate
 
     return compiled_for_c(
-        _derivative, f"derivative_{name}", arguments=_ARGUMENTS, _code_lines=lines
+        _derivative, f"derivative_{name}", arguments=_ARGUMENTS, _code_lines=straight_line_intrinsic
     )
 
 
-def _flight_constants(numbers, uniform):
-    """What depends on a problem's numbers alone: each copy of `_before` has its own."""
+def _write_flight_constants(numbers, uniform):
+    """What depends on a problem's numbers alone: each copy of `_compute_before_flight` has its own."""
     raise NotImplementedError
 
 
-def _before(numbers, uniform):
-    _flight_constants(numbers, uniform)
+def _compute_before_flight(numbers, uniform):
+    _write_flight_constants(numbers, uniform)
 
 
 def _compile_flight_constants(code: Code, name: str) -> Callable[[int, int], None]:
     """Compile what is known before a flight: a function of the addresses of numbers (D,) and inputs (U,), in lanes."""
 
     @intrinsic
-    def numbers_before(_context, source, uniform):
+    def flight_constants_intrinsic(_context, source, uniform):
         def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
             numbers, inputs = arguments
             load = lambda b, x: b.load(_element_address(b, numbers, x.arguments[0]), align=8)  # noqa: E731
@@ -281,7 +285,10 @@ def _compile_flight_constants(code: Code, name: str) -> Callable[[int, int], Non
         return types.void(source, uniform), generate
 
     address = compiled_for_c(
-        _before, f"before_{name}", arguments=2, _flight_constants=numbers_before
+        _compute_before_flight,
+        f"before_{name}",
+        arguments=2,
+        _flight_constants=flight_constants_intrinsic,
     )
     return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address)
 

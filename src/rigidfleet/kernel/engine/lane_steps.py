@@ -134,7 +134,7 @@ def _count_coordinates(k, p):
 
 
 @jit_inline
-def advance(k, stage, _a, h, p):
+def write_stage_state(k, stage, _a, h, p):
     """As `dopri5.advance`."""
     coordinates = _count_coordinates(k, p)
     p.stage[0] = stage
@@ -183,7 +183,7 @@ def squared_errors(k, h, rtol, p):
 
 
 @jit_inline
-def _write_half_step(points, q, y, quarter, y_new, slope, slope_new):
+def _write_half_bernstein(points, q, y, quarter, y_new, slope, slope_new):
     """Write Bernstein coefficients of a state q over half a step, from its value after a quarter of the step.
 
     Slopes are multiplied by a quarter of the half.
@@ -194,7 +194,7 @@ def _write_half_step(points, q, y, quarter, y_new, slope, slope_new):
 
 
 @jit_inline
-def _write_halves(k, q, slopes, h, early, late):
+def _write_bernstein_halves(k, q, slopes, h, early, late):
     """Write the coefficients of a state over both halves of a step into ``early`` and ``late`` (5, n).
 
     Between, it is the polynomial of fifth degree through three states with their derivatives, ``slopes``.
@@ -206,8 +206,8 @@ def _write_halves(k, q, slopes, h, early, late):
     last = (11 / 128) * y + (72 / 128) * middle + (45 / 128) * y_new
     last += (h / 256) * (3.0 * d + 36.0 * d_middle - 9.0 * d_new)
     s = 0.125 * h
-    _write_half_step(early, q, y, quarter, middle, s * d, s * d_middle)
-    _write_half_step(late, q, middle, last, y_new, s * d_middle, s * d_new)
+    _write_half_bernstein(early, q, y, quarter, middle, s * d, s * d_middle)
+    _write_half_bernstein(late, q, middle, last, y_new, s * d_middle, s * d_new)
 
 
 @jit
@@ -219,7 +219,7 @@ def record_trail_forces(p, state, array, row):
 
 
 @jit
-def keep_step(t, h, p, w, state):
+def record_step(t, h, p, w, state):
     """As `dopri5.keep_step`, for each flight into its own trail.
 
     The halves of the step are kept as two.
@@ -240,9 +240,9 @@ def keep_step(t, h, p, w, state):
     early, late = p.halves[0], p.halves[1]
     for q in range(coordinates):
         i = coordinates + q
-        _write_halves(k, q, (k[STATE, i], k[MIDDLE, i], k[TRIAL, i]), h, early, late)
+        _write_bernstein_halves(k, q, (k[STATE, i], k[MIDDLE, i], k[TRIAL, i]), h, early, late)
     for q in range(coordinates, n):
-        _write_halves(k, q, (k[0, q], k[SLOPE, q], k[STAGES - 1, q]), h, early, late)
+        _write_bernstein_halves(k, q, (k[0, q], k[SLOPE, q], k[STAGES - 1, q]), h, early, late)
     for half in range(2):
         place = row if half == 0 else after
         scatter_lanes(fill_lanes(t + half * 0.5 * h), trails[CLOCK], 2 * place)
@@ -254,14 +254,14 @@ def keep_step(t, h, p, w, state):
 
 
 @jit
-def keep_start(p, w, state):
-    """As `dopri5.keep_start`, for each flight into its own trail."""
+def record_start_forces(p, w, state):
+    """As `dopri5.record_start_forces`, for each flight into its own trail."""
     record_trail_forces(p, state, START, 0)
 
 
 @jit
-def keep_samples(t, h, t_new, times, samples, p, state):
-    """As `dopri5.keep_samples`, for each flight into its own samples, from the halves of a step that is kept."""
+def write_step_samples(t, h, t_new, times, samples, p, state):
+    """As `dopri5.write_step_samples`, for each flight into its own samples, from the halves of a step that is kept."""
     count, n = state.count, state.K.shape[1]
     while count[SAMPLES] < times.shape[0] and times[count[SAMPLES]] <= t_new:
         x = 2.0 * (times[count[SAMPLES]] - t) / h
@@ -286,10 +286,10 @@ INSTEAD = {
     "_TRAIL_ROWS": 2,
     "STATE": STATE,
     "TRIAL": TRIAL,
-    "advance": advance,
+    "write_stage_state": write_stage_state,
     "forget_stages": forget_stages,
-    "keep_samples": keep_samples,
-    "keep_start": keep_start,
+    "write_step_samples": write_step_samples,
+    "record_start_forces": record_start_forces,
     "squared_errors": squared_errors,
     # The tables of an `UnrolledProblem` are named as those of a `Disturbance`.
     "step_size": step_to_knot,

@@ -253,7 +253,7 @@ def _compile_part(part: str) -> list[bytes]:
         return parts
     from rigidfleet.kernel.engine import build
 
-    return build.LIBRARIES.get(part, build.flight_code)()
+    return build.LIBRARIES.get(part, build.flight_object_code)()
 
 
 def _shipped_code(digest: str) -> list[Path]:

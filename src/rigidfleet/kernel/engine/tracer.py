@@ -19,6 +19,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
+from rigidfleet._common.renamed import getattr_of_earlier_names
 from rigidfleet.kernel import dynamics, gauge
 from rigidfleet.kernel.problem import EXACT, ITERATED, Graph, Problem, workspace
 from rigidfleet.typing import Floats, Ints
@@ -131,25 +132,25 @@ class Trace:
         dy = np.full(len(y), 0.0, dtype=object)
         p = self._with_symbols(problem)
         reference = p.reference._replace(d0=p.reference.d0[order], d1=p.reference.d1[order])
-        p = p._replace(graph=_reorder(p.graph, order), reference=reference)
+        p = p._replace(graph=_reorder_edges(p.graph, order), reference=reference)
         self._as_plain_python(dynamics.closed_loop)(0.0, y, dy, p, w)
         self.outputs: list[Any] = dy[np.argsort(states)].tolist()
         self.coordinates = 3 * n
         if any(self.outputs[q] is not y[3 * n + q] for q in range(3 * n)):
             raise UnfitError("a derivative of a position that is not the velocity")
-        self.gauge: list[Any] = self._gauged_forces(p, w, order)
+        self.gauge: list[Any] = self._watched_forces(p, w, order)
 
     def _with_symbols(self, problem: Problem) -> Problem:
         """The problem with symbols in place of its numbers."""
-        _, self._values, which = structure(problem)
+        _, self._values, which = code_structure(problem)
         self._numbers = iter(which.tolist())
         p = _drop_unused_parts(problem)
         p = p._replace(**{name: self._symbols_of(getattr(p, name)) for name in _PARTS})
         before = [self.symbol("before", k) for k in range(len(problem.graph.edges))]
         return p._replace(reference=p.reference._replace(d0=np.array(before, dtype=object)))
 
-    def _gauged_forces(self, p: Problem, w: Any, order: Ints) -> list[Any]:
-        """Forces to watch, see `gauge.write_force_gauge`: none."""
+    def _watched_forces(self, p: Problem, w: Any, order: Ints) -> list[Any]:
+        """Forces to watch, see `gauge.write_watched_forces`: none."""
         return []
 
     def known_positive(self, x: Symbol) -> bool:
@@ -275,16 +276,16 @@ class Trace:
         }
         worlds: dict[int, dict[str, Any]] = {}
 
-        def rebuild(function: Dispatcher) -> FunctionType:
+        def rebuild_in_python(function: Dispatcher) -> FunctionType:
             source = function.py_func.__globals__
             if id(source) not in worlds:
                 world = worlds[id(source)] = dict(source)
                 calls = {k: v for k, v in source.items() if isinstance(v, Dispatcher)}
-                world.update({k: rebuild(v) for k, v in calls.items()})
+                world.update({k: rebuild_in_python(v) for k, v in calls.items()})
                 world.update(instead)
             return FunctionType(function.py_func.__code__, worlds[id(source)])
 
-        return rebuild(function)
+        return rebuild_in_python(function)
 
 
 #: Numbers in which the problems of eight flights may differ, and arrays of numbers. Those of the last lines are left
@@ -305,7 +306,7 @@ _MAY_BE_ZERO = {*_NUMBERS[-4:], *_ARRAYS[-2:]}
 _numbers_of, _arrays_of = attrgetter(*_NUMBERS), attrgetter(*_ARRAYS)
 
 
-def numbers(problems: Iterable[Problem]) -> Floats:
+def varying_numbers(problems: Iterable[Problem]) -> Floats:
     """The numbers (U, B) in which B problems of one graph may differ, in the order of `FlightTrace`."""
     rows = [
         np.concatenate([_numbers_of(p), *[x if x.ndim == 1 else x.ravel() for x in _arrays_of(p)]])
@@ -336,13 +337,13 @@ class FlightTrace(Trace):
         super().__init__(problem)
 
     def known_positive(self, x: Symbol) -> bool:
-        """Whether a number is positive: in all problems, or in none (`flight_structure`)."""
+        """Whether a number is positive: in all problems, or in none (`flight_code_structure`)."""
         return bool((self._values[x.arguments[0]] > 0.0).all())
 
     def _with_symbols(self, problem: Problem) -> Problem:
         parts: dict[str, dict[str, Any]] = {}
         there = _nonzero_by_name(problem, self._values)
-        for name, index, x in _number_places(problem):
+        for name, index, x in _named_numbers(problem):
             zero = not there.get(name, True)
             made = [0.0 if zero else self.symbol("uniform", index + k) for k in range(np.size(x))]
             part, field = name.split(".")
@@ -364,16 +365,16 @@ class FlightTrace(Trace):
         made = [self.symbol("table", which, k) for k in range(math.prod(shape))]
         return np.array(made, dtype=object).reshape(shape)
 
-    def _gauged_forces(self, p: Problem, w: Any, order: Ints) -> list[Any]:
+    def _watched_forces(self, p: Problem, w: Any, order: Ints) -> list[Any]:
         n, m = len(p.vehicles.m), len(order)
         values = np.full(5 * n + 2 * m, 0.0, dtype=object)
-        self._as_plain_python(gauge.write_force_gauge)(p, w, values)
+        self._as_plain_python(gauge.write_watched_forces)(p, w, values)
         places = np.arange(len(values))
         places[3 * n : 3 * n + 2 * m] = np.concatenate([3 * n + order, 3 * n + m + order])
         return values[np.argsort(places)].tolist()
 
 
-def _number_places(problem: Problem) -> Iterator[tuple[str, int, Any]]:
+def _named_numbers(problem: Problem) -> Iterator[tuple[str, int, Any]]:
     """Name, place among `numbers` and value of each number, and of each array of numbers."""
     index = 0
     values = (*_numbers_of(problem), *_arrays_of(problem))
@@ -386,12 +387,12 @@ def _nonzero_by_name(problem: Problem, values: Floats) -> dict[str, bool]:
     """Whether numbers that may be zero are not zero in all of eight problems."""
     return {
         name: bool(values[index : index + np.size(x)].any())
-        for name, index, x in _number_places(problem)
+        for name, index, x in _named_numbers(problem)
         if name in _MAY_BE_ZERO
     }
 
 
-def flight_structure(problem: Problem, values: Floats, moves: Sequence[bool]) -> bytes:
+def flight_code_structure(problem: Problem, values: Floats, moves: Sequence[bool]) -> bytes:
     """Everything that the code of a `FlightTrace` depends on.
 
     Raises
@@ -476,7 +477,7 @@ def _distinct_symbols(values: Iterable[Any], known: range) -> list[Symbol]:
     return list({x.serial: x for x in symbols}.values())
 
 
-def structure(problem: Problem) -> tuple[bytes, Floats, Ints]:
+def code_structure(problem: Problem) -> tuple[bytes, Floats, Ints]:
     """Everything that straight-line code depends on: problems with equal structures share the code.
 
     Returns the structure; the distinct numbers of the problem, in the order of their first appearance;
@@ -512,7 +513,7 @@ def elimination_order(edges: NDArray[np.integer]) -> Ints:
     return np.array(order, dtype=np.int64)
 
 
-def _reorder(graph: Graph, order: Ints) -> Graph:
+def _reorder_edges(graph: Graph, order: Ints) -> Graph:
     pairs = np.sort(np.argsort(order)[graph.pairs.astype(np.int64)], axis=1)[:, ::-1]
     return graph._replace(edges=graph.edges[order], pairs=pairs, diagonal=graph.diagonal[order])
 
@@ -554,3 +555,11 @@ def _is_number(x: Any, number: float) -> bool:
 
 def _has_symbol(*values: Any) -> bool:
     return any(isinstance(x, Symbol) for x in values)
+
+
+__getattr__ = getattr_of_earlier_names(
+    __name__,
+    flight_structure="flight_code_structure",
+    structure="code_structure",
+    numbers="varying_numbers",
+)

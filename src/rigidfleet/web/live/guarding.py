@@ -37,14 +37,14 @@ def with_avoidance(mission: Mission) -> tuple[Mission, str]:
         return mission, "a vehicle starts in an obstacle"
     data = mission.to_dict()
     if mission.vehicle_models is None:
-        data |= _as_vehicles(mission, data)
+        data |= _points_as_vehicles(mission, data)
     try:
         return mission.rewritten(data | {"avoidance": {"clearance": clear}}), ""
     except MissionError as error:
         return mission, error.findings[0].problem
 
 
-def _as_vehicles(mission: Mission, data: dict[str, Any]) -> dict[str, Any]:
+def _points_as_vehicles(mission: Mission, data: dict[str, Any]) -> dict[str, Any]:
     """Tables in which the points of a mission are vehicles of their own."""
     kinds: dict[tuple[float, ...], str] = {}
     names = []

@@ -128,7 +128,7 @@ class Pilot:
         shaped = [p.shaping.formation for p in mission.phases if p.shaping is not None]
         first = next((name for name in shaped if name in self.formations), self.formations[0])
         self._begin_formation(first, establish=True)
-        self.pose = self._reference()
+        self.pose = self._first_pose()
         self.a, self.alpha = np.zeros(3), np.zeros(3)
         x, y, z = self.pose.r
         size = np.linalg.norm(self._slots, axis=1).max() + max(mission.agents.radius)
@@ -286,7 +286,7 @@ class Pilot:
             flight.advance(self.ticks * TICK - t)
             for ball in self.flying_balls:
                 ball.move(self.t - t)
-            if not flight.ending and (met := flight.contact()) is not None:
+            if not flight.ending and (met := flight.deepest_contact()) is not None:
                 name = flight.mission.obstacles[met.other].name
                 flight.ending = f"agent {met.who + 1} met '{name}' at {met.time:.2f} s"
         if flight.pieces or self.last is None:
@@ -350,7 +350,7 @@ class Pilot:
 
     # -- the reference ----------------------------------------------------------------------------
 
-    def _reference(self) -> Pose:
+    def _first_pose(self) -> Pose:
         """The pose that the first phase begins with."""
         flight, frame = self.flight, self.flight.plan.frame
         pose = flight.pose()
@@ -439,7 +439,7 @@ class Pilot:
                 ball.predicted_sphere(self.t) if ball.until is None else ball.flown_sphere(self.t)
                 for ball in self.balls
             ]
-            self.flight.among((*self.mission.obstacles, *seen))
+            self.flight.replace_obstacles((*self.mission.obstacles, *seen))
 
     # -- wind -------------------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ from rigidfleet._common.files import write_file
 from rigidfleet.math.piecewise import piece_index
 from rigidfleet.plotting.logged import off_plan
 from rigidfleet.result import Result, as_result
-from rigidfleet.result.lights import has_lights, view_angles
+from rigidfleet.result.lights import angles_facing_formation, has_lights
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn, pack_columns
 from rigidfleet.web.replay.page import page
@@ -27,7 +27,7 @@ from rigidfleet.web.replay.scene import (
     describe_scene,
     page_samples,
     sight_points,
-    typical_reach,
+    typical_formation_radius,
     vehicle_weight,
 )
 
@@ -112,7 +112,7 @@ def replay_page(result: Result) -> str:
     )
     info = describe_scene(result, shown, tension) | _flight_information(result, time)
     if has_lights(result):
-        azimuth, elevation = view_angles(result)
+        azimuth, elevation = angles_facing_formation(result)
         info |= {"night": True, "azimuth": azimuth, "elevation": elevation}
     info |= {"columns": described, "count": len(time), "beyond": most > tension}
     info |= {"note": _flight_note(result, shown, tension, most), "swarm": swarm}
@@ -158,7 +158,7 @@ def _drawn_edges(result: Result) -> Ints:
 def _flight_information(result: Result, time: Floats) -> dict[str, Any]:
     """Information on the page about a finished flight."""
     low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
-    extent, reach = float(np.linalg.norm(high - low)) / 2, typical_reach(result)
+    extent, reach = float(np.linalg.norm(high - low)) / 2, typical_formation_radius(result)
     seen = sight_points(result.mission, low, high)
     least, most = seen.min(axis=0), seen.max(axis=0)
     way = (result.cm[-1] - result.cm[0])[:2]

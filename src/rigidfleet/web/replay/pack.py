@@ -33,12 +33,12 @@ def pack_columns(columns: Mapping[str, PackedColumn]) -> tuple[list[dict[str, An
     for name, (values, step) in columns.items():
         flat = values.reshape(len(values), -1)
         described.append({"name": name, "width": flat.shape[1], "step": step})
-        planes.append(_bytes_of_differences(flat.T / step))
+        planes.append(_second_difference_bytes(flat.T / step))
     data = zlib.compress(b"".join(planes), 6)
     return described, base64.b64encode(data).decode("ascii")
 
 
-def _bytes_of_differences(rows: Floats) -> bytes:
+def _second_difference_bytes(rows: Floats) -> bytes:
     """Second differences of rounded rows, lowest bytes first; sums of 32 bits wrap around."""
     whole = np.clip(np.round(rows), _MISSING + 1, -_MISSING - 1)
     steps = np.where(np.isnan(rows), _MISSING, whole).astype(np.int64)

@@ -13,7 +13,7 @@ from rigidfleet.plotting.areas import fall_places_by_sample
 from rigidfleet.plotting.logged import off_plan
 from rigidfleet.plotting.quadrotors import has_rotors, rotor_forces, rotor_limits
 from rigidfleet.result import quantities
-from rigidfleet.result.lights import has_lights, lights
+from rigidfleet.result.lights import has_lights, light_colours
 from rigidfleet.solids.outline import outline_of_solid
 from rigidfleet.solids.records import swept_extent
 from rigidfleet.typing import Floats, Ints
@@ -38,7 +38,7 @@ def describe_scene(result: Result, shown: Ints, tension: float) -> dict[str, Any
     Full colour of an edge stands for ``tension`` [N].
     """
     mission = result.mission
-    boxes = [(o.name, o.corners) for o in mission.obstacles if is_plain_box(o) and o.corners]
+    boxes = [(o.name, o.box_bounds) for o in mission.obstacles if is_plain_box(o) and o.box_bounds]
     fence = mission.limits.geofence
     rotors = {"rotors": np.isfinite(rotor_limits(mission)).tolist()} if has_rotors(result) else {}
     return {
@@ -61,7 +61,7 @@ def describe_scene(result: Result, shown: Ints, tension: float) -> dict[str, Any
 
 def is_plain_box(thing: Obstacle) -> bool:
     """Whether an obstacle is a box along the axes at rest, and no zone; the page has a picture of its own for these."""
-    return thing.kind == "box" and thing.corners is not None and not thing.zone
+    return thing.kind == "box" and thing.box_bounds is not None and not thing.zone
 
 
 def _solid_surface(thing: Obstacle) -> dict[str, Any]:
@@ -104,11 +104,11 @@ def page_samples(result: Result, shown: Ints, tension: float) -> dict[str, Packe
     """Samples for the page, at the result's times; ``shown`` are the edges drawn."""
     mission = result.mission
     # Fine enough for a vehicle that fills the screen.
-    fine = max(typical_reach(result), *mission.agents.radius, 1e-9) / 20_000
+    fine = max(typical_formation_radius(result), *mission.agents.radius, 1e-9) / 20_000
     return {
         "position": PackedColumn(result.position, fine),
         **dict(_attitude_columns(result)),
-        **dict(_further_columns(result, shown, fine)),
+        **dict(_optional_columns(result, shown, fine)),
         "slot": PackedColumn(result.slot_position - result.position, fine),
         "cm": PackedColumn(result.cm, fine),
         "attitude": PackedColumn(result.attitude, 1e-4),
@@ -140,7 +140,7 @@ def _attitude_columns(result: Result) -> Iterator[tuple[str, PackedColumn]]:
         yield "saturated", PackedColumn(np.where(result.left, saturated != 0, 0.0), 1.0)
 
 
-def _further_columns(
+def _optional_columns(
     result: Result, shown: Ints, fine: float
 ) -> Iterator[tuple[str, PackedColumn]]:
     """Samples that some flights have: layers of avoidance, lights, ages of messages, falls, doubt."""
@@ -153,7 +153,7 @@ def _further_columns(
         acts = np.where(layers > 1, 2.0, np.where(layers == 1, 1.0, 0.0))
         yield "acts", PackedColumn(acts, 1.0)
     if has_lights(result):  # red, green and blue
-        yield "light", PackedColumn(lights(result, result.time), 1 / 255)
+        yield "light", PackedColumn(light_colours(result, result.time), 1 / 255)
     if age is not None and (net := mission.network) is not None:
         # How near an edge is to being let go for want of messages, from 0 to 1
         oldest = np.where(np.isnan(age), np.inf, age)[:, shown].max(axis=2)
@@ -201,7 +201,7 @@ def thrust_directions(force: Floats, mass: Floats) -> Floats:
     return force / np.maximum(np.linalg.norm(force, axis=-1, keepdims=True), 1e-300)
 
 
-def typical_reach(result: Result) -> float:
+def typical_formation_radius(result: Result) -> float:
     """Typical greatest distance [m] of an agent from the centre of mass."""
     reach = np.linalg.norm(result.position - result.cm[:, None], axis=2).max(axis=1)
     return float(np.median(reach))
@@ -256,7 +256,7 @@ def _plots(result: Result) -> Iterator[tuple[dict[str, Any], PackedColumn]]:
         error = error.max(axis=1, initial=-1.0)
         error = np.where(error < 0.0, np.nan, error)
         yield plot_entry("error", "Constraint error", error, _FLOOR, log=True)
-    least = {"worst": "least", "least": limits.separation_always}
+    least = {"worst": "least", "least": limits.separation_at_all_heights}
     if n > 1:
         yield plot_entry("separation", "Separation", result.separation, 1e-3, **least)
     if mission.obstacles:
