@@ -244,7 +244,8 @@ def _vehicle_mismatch(phase: Follow, now: PhaseState) -> str:
     speed = pose.v[None] + (0.0 if alone else np.cross(pose.omega, now.slots) @ pose.T)
     if now.rates is not None and not alone:
         speed = speed + now.rates[0] @ pose.T
-    length = phase.travel or (phase.duration if isinstance(phase.duration, float) else knots[-1])
+    known = phase.travel or phase.duration or (phase.until or 0.0) - now.t
+    length = knots[-1] if phase.automatic else known
     missed = first[..., 0] - place, first[..., 1] * (knots[-1] / length) - speed
     off = np.linalg.norm(missed, axis=2)
     for far, most, unit in zip(off, _START_TOLERANCES, ("m", "m/s"), strict=False):
