@@ -428,6 +428,19 @@ def test_files_that_end_in_motion_are_followed_by_files_alone():
             rf.simulate(rf.Mission.from_dict(data | {"phases": [before, hold]}))
 
 
+def test_files_are_flown_on_from_beside_an_obstacle():
+    """A file that begins while the formation evades a ball is led to, and its last point is reached."""
+    data = rf.load_mission("moving-obstacles").to_dict()
+    place = np.mean(rf.load_mission("moving-obstacles").fleet.position, axis=0)
+    x, y, z = place.tolist()
+    ways = [[10.0, x + d, 1.5, y, 0.0, z, 0.0, 0.0, 0.0] for d in (0.0, 15.0)]
+    data["agents"]["velocity"] = [[1.5, 0.0, 0.0]] * 8
+    data["phases"] = [{"kind": "follow", "trajectories": [[way]], "duration": 10.0} for way in ways]
+    result = rf.simulate(rf.Mission.from_dict(data))
+    assert result.complete, result.ending
+    assert np.linalg.norm(result.cm[-1] - place - [30.0, 0, 0]) < 0.1
+
+
 def _piece(duration, begin, velocity):
     """From rest at a place to a velocity, a row of a trajectory."""
     T, both = duration, zip(begin, velocity, strict=True)

@@ -169,7 +169,8 @@ def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) 
 def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> Course:
     """Follow the trajectory of the virtual body, or the mean of the vehicles' own, about which the slots then move.
 
-    What the first point of a file differs from the place where the vehicles are fades over `_FADED`.
+    What the first point of a file differs from the place where the vehicles are fades over `_FADED`; more, as avoidance
+    may leave, over longer, so that its acceleration stays.
     """
     pose, before, slots = now.attached
     way = phase.pieces
@@ -180,7 +181,9 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
     begin = np.concatenate(
         [np.stack([pose.r, pose.v, pose.a, pose.jerk]), rotation_to_pose(pose, T1)], 1
     )
-    lift, fade = None, min(_FADED, float(knots[-1]))
+    place = pose.r + (slots @ pose.T if pieces.shape[1] > 1 else 0.0)
+    off = float(np.linalg.norm(pieces[0, :, :3, 0] - place, axis=1).max()) / _START_TOLERANCES[0]
+    lift, fade = None, min(_FADED * math.sqrt(max(off, 1.0)), float(knots[-1]))
     body = np.zeros((len(pieces), 6, pieces.shape[-1]))
     if pieces.shape[1] == 1:
         body[:, :3] = pieces[:, 0, :3]

@@ -253,8 +253,7 @@ class Show:
             strange = sorted({*read.names} - {*self.names})
             if 0 < len(strange) < self.n:  # where some names agree, they say whose a file is
                 raise RigidfleetError(
-                    f"{files[0]}: has {first_few(strange)}, and the show has not. Give the vehicles of both the same"
-                    " names."
+                    f"{files[0]}: has {first_few(strange)}, and the show has not. Name the vehicles of both alike."
                 )
             if not strange and self.names:
                 order = [read.names.index(name) for name in self.names]
