@@ -369,6 +369,7 @@ def test_a_late_vehicle_is_not_aligned_away(plan: rf.Result) -> None:
     assert verdict.word == "failed"
     _, verdict = judge_log(log, plan, Doubts(SIGMA, 0.0, "own"))
     assert "separation is not judged: vehicles have no common clock" in verdict.summary
+    assert not any("by itself" in note for note in verdict.notes)  # one note has all clocks
     assert verdict.word == "undecided"
     _, same = judge_log(log._replace(own_clocks=True), plan, Doubts(SIGMA, 0.0))  # as files say
     assert same.summary == verdict.summary

@@ -296,7 +296,7 @@ def doubt_notes(facts: dict[str, Any]) -> Iterator[str]:
             x, y, z = (value(1e3 * x) for x in each["mean_off_xyz_m"])
             peak = f"{value(1e3 * each['worst_off_m'], 'mm')} at {each['worst_at_s']:.2f} s"
             yield f"{each['name']!r} is {_with_error(off, by)} mm off its slot on average, ({x}, {y}, {z}), and {peak}"
-        if each["late"]:
+        if each["late"] and facts["clock"] != "own":  # then all are told at once
             yield f"{each['name']!r} is {_lateness_in_words(*each['offset_s'])} by itself: its clock, or its tracking"
 
 
