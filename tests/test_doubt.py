@@ -439,6 +439,16 @@ def test_a_log_whose_last_samples_are_lost_is_complete(plan: rf.Result) -> None:
         assert verdict.by_name["complete"].passed == complete
 
 
+def test_few_ways_drawn_reach_what_is_rare(
+    plan: rf.Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of much noise, waypoints of a clean flight seem missed by more than any of some ways drawn: none is failed."""
+    monkeypatch.setattr("test_doubt.SIGMA", 0.1)
+    for seed in (0, 2, 14):
+        log = flown(plan, np.random.default_rng(seed))
+        assert not judge_log(log, plan, Doubts(0.1, 0.0))[1].failures
+
+
 def test_what_would_decide_a_shape_decides() -> None:
     """Where all that seems to be missed may be noise, the noise that would decide is one with which it does."""
     plan = rf.simulate("hexagon")

@@ -108,7 +108,7 @@ class DrawnWays:
         if values is None or values.shape != sizes.shape[1:]:
             return most
         # Only what is near the worst value may be the worst in truth.
-        return float(sizes[:, values >= q.rank(check.worst) - 2.0 * most].max(initial=0.0))
+        return _greatest(sizes[:, values >= q.rank(check.worst) - 2.0 * most])
 
     def _near_pairs(self, reach: float) -> tuple[Ints, Ints, Ints]:
         """Samples and pairs whose surfaces are nearer than a distance: the nearest ones, if they are many."""
@@ -128,7 +128,13 @@ def _lengths(x: Floats) -> Floats:
 
 
 def _greatest_length(x: Floats) -> float:
-    return float(_lengths(x).max(initial=0.0))
+    return _greatest(_lengths(x))
+
+
+def _greatest(sizes: Floats) -> float:
+    """How great lengths (S, ...) of deviations of S ways drawn may be: so few ways alone do not reach what is rare."""
+    squares = float(np.einsum("s...,s...->...", sizes, sizes).max(initial=0.0))
+    return max(float(sizes.max(initial=0.0)), _SURE * math.sqrt(squares / (3 * len(sizes))))
 
 
 def _quantity_name(check: CheckResult) -> str:
