@@ -5,7 +5,7 @@ import sys
 import warnings
 import xml.etree.ElementTree as ET
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, permutations
 from typing import Any
 
 import matplotlib as mpl
@@ -1107,13 +1107,18 @@ def test_axes_keep_clear_of_one_another(name, cube):
     np.testing.assert_allclose(places[1], places[0], rtol=0, atol=1e-6)  # of the page
 
 
-@pytest.mark.parametrize("flight", [*FLIGHTS, "two-agents"])
+@pytest.mark.parametrize(
+    "flight", [*FLIGHTS, "two-agents", "single-waypoint", "market-square", "bridge-inspection"]
+)
 def test_the_summary_is_on_the_page(flight):
-    """No number, name or curve of the summary's axes over time leaves the page, whatever is known of the flight."""
+    """No number, name or curve of the summary's axes leaves the page or covers another, whatever is known of the flight."""
     if flight in FLIGHTS:
         figure = drawn("summary", a_flight(**{"samples": 31} | FLIGHTS[flight]))
-    else:  # its errors reach down to 1e-12 m
+    else:  # errors down to 1e-12 m; long words above axes; small angles; lengths that stay
         figure = drawn("summary", simulate(load_mission(flight)))
+    assert covering(figure) == []
+    for a, b in permutations(figure.axes[1:], 2):
+        assert not a.yaxis.label.get_window_extent().overlaps(b.bbox), a.get_ylabel()
     for ax in figure.axes[1:]:
         box = ax.get_tightbbox()
         assert box is not None

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+#: Share of the page's width beside an axes for its numbers.
+_ASIDE = 0.046
+
 
 def _legend_above(ax: Axes, handles: list[Any]) -> None:
     ax.legend(
@@ -24,12 +27,19 @@ def _legend_above(ax: Axes, handles: list[Any]) -> None:
     )  # fmt: skip
 
 
+def _give_numbers_room(ax: Axes) -> None:
+    """Move the left end of an axes to the right as far as its numbers and their name stand out of its column."""
+    left, bottom, width, height = ax.get_position().bounds
+    over = left - _ASIDE - ax.yaxis.get_tightbbox().x0 / ax.figure.bbox.width
+    if over > 0.0:
+        ax.set_position((left + over, bottom, width - over, height))
+
+
 def _draw_attitude(ax: Axes, result: Result) -> None:
     """Three Euler angles in one axes, dark to light; without an attitude, the constraint error."""
     flown, wanted, _ = curves.flown_and_wanted_euler(result)
     if not np.isfinite(flown).any():
         entries = curves.draw_constraint_error(ax, result)
-        ax.yaxis.labelpad = 2  # powers of ten are wide
         if entries:
             _legend_above(ax, entries)
         return
@@ -55,9 +65,9 @@ def summary(result: Result) -> Figure:
     st.draw_head(fig, result, st.clean_name(result.mission.title, 80) or "Flight")
     view = space.trajectory_scene(result)
     space.draw_trajectory_in_space(fig, result, view, (0.0, 0.49, 0.41, 0.47))
-    space.draw_trajectory_from_above(fig.add_axes((0.45, 0.56, 0.22, 0.36)), result, view)
-    lengths = fig.add_axes((0.73, 0.56, 0.255, 0.345))
-    angles, thrust, apart = (fig.add_axes((x, 0.165, 0.27, 0.285)) for x in (0.05, 0.385, 0.715))
+    space.draw_trajectory_from_above(fig.add_axes((0.475, 0.575, 0.195, 0.345)), result, view)
+    lengths = fig.add_axes((0.73, 0.575, 0.255, 0.33))
+    angles, thrust, apart = (fig.add_axes((x, 0.165, 0.27, 0.275)) for x in (0.05, 0.385, 0.715))
     over_time = (lengths, angles, thrust, apart)
     for ax in over_time:
         st.draw_time_axis(ax, result)
@@ -74,6 +84,8 @@ def summary(result: Result) -> Figure:
     _draw_attitude(angles, result)
     curves.draw_thrust(thrust, result)
     curves.draw_least(apart, result, "clearance" if result.mission.obstacles else "separation")
+    for ax in over_time:
+        _give_numbers_room(ax)
     entries = space.trajectory_handles(result, view)
     fig.legend(
         handles=entries, loc="lower center", ncols=math.ceil(len(entries) / (1 if len(entries) <= 10 else 2)),
