@@ -1111,7 +1111,7 @@ def test_axes_keep_clear_of_one_another(name, cube):
     "flight", [*FLIGHTS, "two-agents", "single-waypoint", "market-square", "bridge-inspection"]
 )
 def test_the_summary_is_on_the_page(flight):
-    """No number, name or curve of the summary's axes leaves the page or covers another, whatever is known of the flight."""
+    """No number, name or curve of the summary's axes leaves the page or covers another one."""
     if flight in FLIGHTS:
         figure = drawn("summary", a_flight(**{"samples": 31} | FLIGHTS[flight]))
     else:  # errors down to 1e-12 m; long words above axes; small angles; lengths that stay

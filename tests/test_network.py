@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import rigidfleet as rf
-from rigidfleet._common.toml import to_toml
 from rigidfleet import plotting
+from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import MissionError
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.engine import native, sampled

@@ -88,11 +88,10 @@ def draw_ground(result: Result, falls: Floats) -> Figure:
         flat = places[result.left]
         ax.plot(*flat[:: 1 + len(flat) // _MOST].T, ".", markersize=2, color=colour, zorder=2)
         handles.append(st.legend_entry(what, linestyle="", marker="o", markersize=5, color=colour))
-    alike: dict[str, list[str]] = {}  # names by what they look like
-    for name, _, look in (drawn := drawn_areas(result.mission)):
-        alike.setdefault(str(look), []).append(name)
+    drawn = drawn_areas(result.mission)
     for look in {str(look): look for *_, look in drawn}.values():
-        handles.append(Patch(label=st.clean_name(", ".join(alike[str(look)])), **look))
+        names = ", ".join(name for name, _, other in drawn if other == look)
+        handles.append(Patch(label=st.clean_name(names), **look))
     ax.set(xlabel="x, east [m]", ylabel="y, north [m]")
     ax.margins(0.06)
     ax.set_aspect("equal", adjustable="box")

@@ -16,23 +16,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Share of the page's width beside an axes for its numbers.
-_ASIDE = 0.046
-
 
 def _legend_above(ax: Axes, handles: list[Any]) -> None:
     ax.legend(
         handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.06), ncols=len(handles),
         columnspacing=1.2,
     )  # fmt: skip
-
-
-def _give_numbers_room(ax: Axes) -> None:
-    """Move the left end of an axes to the right as far as its numbers and their name stand out of its column."""
-    left, bottom, width, height = ax.get_position().bounds
-    over = left - _ASIDE - ax.yaxis.get_tightbbox().x0 / ax.figure.bbox.width
-    if over > 0.0:
-        ax.set_position((left + over, bottom, width - over, height))
 
 
 def _draw_attitude(ax: Axes, result: Result) -> None:
@@ -84,8 +73,10 @@ def summary(result: Result) -> Figure:
     _draw_attitude(angles, result)
     curves.draw_thrust(thrust, result)
     curves.draw_least(apart, result, "clearance" if result.mission.obstacles else "separation")
-    for ax in over_time:
-        _give_numbers_room(ax)
+    for ax in over_time:  # numbers wider than 0.046 of the page move the left end of their axes
+        box, place = ax.yaxis.get_tightbbox(), ax.get_position()
+        place.x0 += 0.0 if box is None else max(place.x0 - 0.046 - box.x0 / fig.bbox.width, 0.0)
+        ax.set_position(place)
     entries = space.trajectory_handles(result, view)
     fig.legend(
         handles=entries, loc="lower center", ncols=math.ceil(len(entries) / (1 if len(entries) <= 10 else 2)),
