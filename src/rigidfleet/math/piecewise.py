@@ -65,8 +65,6 @@ class Piecewise(NamedTuple):
     def taylor_coefficients(self, t: Floats, orders: int) -> Floats:
         """Taylor coefficients (orders, T, ...) at times (T,) [s]."""
         k = piece_index(self.time, t)
-        if len(k) and (k == k[0]).all():  # one piece for all times is not copied for each
-            k = k[:1]
         return series.of_polynomials(_take_pieces(self.pieces, k), t - self.time[k], orders)
 
     def at(self, t: Floats) -> Floats:

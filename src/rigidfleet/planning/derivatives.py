@@ -129,9 +129,8 @@ def body_series(motion: Motion, time: Floats, orders: int = ORDERS) -> tuple[Flo
     inside = np.minimum(time, way.time[-1])
     x = np.ascontiguousarray(way.taylor_coefficients(inside, ORDERS).swapaxes(1, 2))
     beyond = time > inside
-    if beyond.any():
-        x[0][:, beyond] += (time - inside)[beyond] * x[1][:, beyond]
-        x[2:, :, beyond] = 0.0
+    x[0][:, beyond] += (time - inside)[beyond] * x[1][:, beyond]
+    x[2:, :, beyond] = 0.0
     cm, phi = x[:orders, :3], x[:, 3:]
     if np.abs(phi).max(initial=0.0) <= _NO_TURN:  # most ways do not turn, but for rounding
         axes = np.zeros((orders, 3, 3, 1))
