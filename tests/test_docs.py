@@ -395,6 +395,33 @@ def test_functions_exist(name):
             assert found is not None, f"{name} names {dotted}"
 
 
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_code_of_the_pages_can_be_imported(path):
+    """Whatever the Python of a page imports of the package is there."""
+    for code in blocks(path.read_text(encoding="utf-8"), "python"):
+        for line in ast.walk(ast.parse(code)):
+            if isinstance(line, ast.ImportFrom) and (line.module or "").startswith("rigidfleet"):
+                module = importlib.import_module(line.module or "")
+                missing = [x.name for x in line.names if not hasattr(module, x.name)]
+                # What is no name of the module is a module below it
+                assert all(importlib.util.find_spec(f"{line.module}.{x}") for x in missing)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_commands_of_the_pages_take_what_they_name(path):
+    """Commands that read results are shown with results."""
+    for code in blocks(path.read_text(encoding="utf-8"), "sh"):
+        for name in re.findall(r"^rigidfleet (?:replay|report|export) (\S+)", code, re.MULTILINE):
+            assert name.endswith(".nc"), name
+
+
+def test_the_code_of_a_crowd_runs(capsys):
+    """Two vehicles that change places have ways, proved."""
+    for code in blocks(page("avoidance.md"), "python"):
+        exec(compile(code, "avoidance.md", "exec"), {})
+    assert "separation" in capsys.readouterr().out
+
+
 def test_tests_exist():
     """Every test that paper.md names is there; every row and every erratum has one."""
     text = page("paper.md")

@@ -369,6 +369,7 @@ def test_a_late_vehicle_is_not_aligned_away(plan: rf.Result) -> None:
     assert verdict.word == "failed"
     _, verdict = judge_log(log, plan, Doubts(SIGMA, 0.0, "own"))
     assert "separation is not judged: vehicles have no common clock" in verdict.summary
+    assert not any("by itself" in note for note in verdict.notes)  # one note has all clocks
     assert verdict.word == "undecided"
     _, same = judge_log(log._replace(own_clocks=True), plan, Doubts(SIGMA, 0.0))  # as files say
     assert same.summary == verdict.summary
@@ -400,6 +401,70 @@ def test_a_vehicle_off_its_slot_is_named(plan: rf.Result) -> None:
     assert off == pytest.approx(50.0, abs=0.5)
     low, high = verdict.by_name["shape"].interval or (0.0, 0.0)
     assert low < 0.05 < high
+
+
+def test_vehicles_in_another_order_are_told(plan: rf.Result) -> None:
+    """A log whose vehicles are in another order than the plan's fails, and a note says whose places they are at."""
+    log = flown(plan, np.random.default_rng(17))
+    turned = log._replace(names=("b", "c", "a"), curves=(*log.curves[1:], log.curves[0]))
+    notes = [judge_log(each, plan, Doubts(SIGMA, 0.0))[1].notes for each in (log, turned)]
+    said = "b, c, a count as agents from 1 on, but are where agents 2, 3, 1 are to be"
+    assert [any(said in note for note in each) for each in notes] == [False, True]
+
+
+def test_a_lost_vehicle_is_not_judged() -> None:
+    """After a planned loss, the others are judged as in the flight itself, and what falls is no part of that."""
+    plan = rf.simulate("falling-light")
+    log = flown(plan, np.random.default_rng(18))
+    _, verdict = judge_log(log, plan, Doubts(SIGMA, 0.0))
+    assert not verdict.failures
+    for name, own in rf.assess(plan).by_name.items():
+        if name in ("separation", "lost", "clearance", "speed", "waypoint_position"):
+            low, high = verdict.by_name[name].interval or (np.inf, np.inf)
+            assert low <= (own.worst or 0.0) <= high, name
+
+
+def test_a_log_whose_last_samples_are_lost_is_complete(plan: rf.Result) -> None:
+    """A log with dropouts that ends some samples before the plan covers the flight; one that ends early does not."""
+    log, random = flown(plan, np.random.default_rng(19)), np.random.default_rng(20)
+    for last, complete in ((2, True), (25, False)):
+        curves = []
+        for curve in log.curves:
+            kept = random.random(len(curve.time)) > 0.3
+            kept[0], kept[-last:], kept[-last - 1] = True, False, True
+            curves.append((curve.time[kept], curve.at(curve.time[kept])[:, :3]))
+        _, verdict = judge_log(
+            logged(*map(list, zip(*curves, strict=True))), plan, Doubts(SIGMA, 0.0)
+        )
+        assert verdict.by_name["complete"].passed == complete
+
+
+def test_few_ways_drawn_reach_what_is_rare(
+    plan: rf.Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of much noise, waypoints of a clean flight seem missed by more than any of some ways drawn: none is failed."""
+    monkeypatch.setattr("test_doubt.SIGMA", 0.1)
+    for seed in (0, 2, 14):
+        log = flown(plan, np.random.default_rng(seed))
+        assert not judge_log(log, plan, Doubts(0.1, 0.0))[1].failures
+
+
+def test_what_would_decide_a_shape_decides() -> None:
+    """Where all that seems to be missed may be noise, the noise that would decide is one with which it does."""
+    plan = rf.simulate("hexagon")
+
+    def check(sigma: float, seed: int) -> Any:
+        t = np.arange(0.0, 15.0 + 1e-9, 0.05)
+        way = ways_of(plan.motion(flown=True), slice(None)).at(t)[..., :3]
+        x = way + sigma * np.random.default_rng(seed).standard_normal(way.shape)
+        log = logged([t] * plan.n_agents, list(x.swapaxes(0, 1)))
+        return judge_log(log, plan, Doubts(sigma, 0.0))[1].by_name["shape"]
+
+    for seed in range(3):
+        first = check(0.05, seed)
+        words = re.search(r"noise of (\S+) mm would decide it", first.message)
+        assert words is not None
+        assert [check(float(words[1]) / 1e3, 10 + k).passed for k in range(2)] == [True, True]
 
 
 def test_the_command_says_undecided(

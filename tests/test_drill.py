@@ -462,6 +462,11 @@ def test_vehicles_of_files_keep_their_names(tmp_path):
         GeometricFault("shifted", 1.3, every[:1], Known(np.array([0.0]), 1))
     )
     assert re.search(r"agents? 1 \(drone \d+\)", failed[2])
+    text = files[1].read_text()
+    other = rows[0].split(",")[1]
+    files[1].write_text(text.replace(f",{other},", ",drone 999,"))
+    with pytest.raises(rf.RigidfleetError, match=r"has drone 999, and the show has not"):
+        Show(show.mission, Drill(files=(str(files[0]),), stale=(str(files[1]),)))
 
 
 @pytest.mark.parametrize("kind", ["folder", "skyc"])

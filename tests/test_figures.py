@@ -5,7 +5,7 @@ import sys
 import warnings
 import xml.etree.ElementTree as ET
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, permutations
 from typing import Any
 
 import matplotlib as mpl
@@ -27,6 +27,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.plotting import curves, sketches, space, style
+from rigidfleet.plotting.areas import draw_ground
 from rigidfleet.plotting.solids import area_from_above
 from rigidfleet.result import LABELS, VARIABLES, PhaseRecord, Result
 from rigidfleet.result.quantities import samples
@@ -1107,18 +1108,36 @@ def test_axes_keep_clear_of_one_another(name, cube):
     np.testing.assert_allclose(places[1], places[0], rtol=0, atol=1e-6)  # of the page
 
 
-@pytest.mark.parametrize("flight", [*FLIGHTS, "two-agents"])
+@pytest.mark.parametrize(
+    "flight", [*FLIGHTS, "two-agents", "single-waypoint", "market-square", "bridge-inspection"]
+)
 def test_the_summary_is_on_the_page(flight):
-    """No number, name or curve of the summary's axes over time leaves the page, whatever is known of the flight."""
+    """No number, name or curve of the summary's axes leaves the page or covers another one."""
     if flight in FLIGHTS:
         figure = drawn("summary", a_flight(**{"samples": 31} | FLIGHTS[flight]))
-    else:  # its errors reach down to 1e-12 m
+    else:  # errors down to 1e-12 m; long words above axes; small angles; lengths that stay
         figure = drawn("summary", simulate(load_mission(flight)))
+    assert covering(figure) == []
+    for a, b in permutations(figure.axes[1:], 2):
+        assert not a.yaxis.label.get_window_extent().overlaps(b.bbox), a.get_ylabel()
     for ax in figure.axes[1:]:
         box = ax.get_tightbbox()
         assert box is not None
         assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1, ax.get_ylabel()
         assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1, ax.get_ylabel()
+
+
+def test_a_legend_has_each_look_of_fences_once():
+    """All of many fences and places with people are in the legend, those that look alike in one entry."""
+    corners = [[0, 0], [30, 0], [30, 30]]
+    fences = [
+        {"kind": "inclusion", "name": f"f{k}", "polygon": corners, "soft": k > 3} for k in range(8)
+    ]
+    people = [{"name": "crowd", "polygon": corners}]
+    flight = a_flight(mission={"fences": fences, "people": people})
+    (legend,) = draw_ground(flight, flight.position[..., :2]).legends
+    names = [text.get_text() for text in legend.get_texts()]
+    assert names[2:] == ["f0, f1, f2, f3", "f4, f5, f6, f7", "crowd"]
 
 
 def test_axes_that_find_no_room_stay(triangle):

@@ -426,3 +426,69 @@ def test_files_that_end_in_motion_are_followed_by_files_alone():
     for before, speed in (phases[0], "0.50"), (cut, "0.25"):
         with pytest.raises(rf.MissionError, match=f"goes on at {speed} m/s beside the others"):
             rf.simulate(rf.Mission.from_dict(data | {"phases": [before, hold]}))
+
+
+def test_files_are_flown_on_from_beside_an_obstacle():
+    """A file that begins while the formation evades a ball is led to, and its last point is reached."""
+    data = rf.load_mission("moving-obstacles").to_dict()
+    place = np.mean(rf.load_mission("moving-obstacles").fleet.position, axis=0)
+    x, y, z = place.tolist()
+    ways = [[10.0, x + d, 1.5, y, 0.0, z, 0.0, 0.0, 0.0] for d in (0.0, 15.0)]
+    data["agents"]["velocity"] = [[1.5, 0.0, 0.0]] * 8
+    data["phases"] = [{"kind": "follow", "trajectories": [[way]], "duration": 10.0} for way in ways]
+    result = rf.simulate(rf.Mission.from_dict(data))
+    assert result.complete, result.ending
+    assert np.linalg.norm(result.cm[-1] - place - [30.0, 0, 0]) < 0.1
+
+
+def _piece(duration, begin, velocity):
+    """From rest at a place to a velocity, a row of a trajectory."""
+    T, both = duration, zip(begin, velocity, strict=True)
+    return [T, *(c for x, v in both for c in (x, 0.0, 0.0, v / T**2, -0.5 * v / T**3)), *[0.0] * 5]
+
+
+@pytest.mark.parametrize(
+    ("speeds", "durations", "keys", "words"),
+    [
+        ((0.0, 1.0), (2.0, 2.0), {"travel": 2.0, "duration": 4.0}, "agent 1 goes on at 0.50 m/s"),
+        ((0.0, 1.0), (2.0, 2.0), {"travel": 2.0, "until": 4.0}, "agent 1 goes on at 0.50 m/s"),
+        ((0.0, 1.0), (4.0, 2.0), {"duration": 4.0}, "jumps by 1 m/s at 2 s"),
+        ((0.0, 1.0), (2.0, 4.0), {"duration": 4.0}, ""),
+        ((1.0, 1.0), (2.0, 2.0), {"travel": 2.0, "duration": 4.0}, ""),
+        ((0.0, 1.0), (2.0, 2.0), {"travel": 4.0, "duration": 2.0}, ""),
+    ],
+)
+def test_no_vehicle_stops_at_once_within_a_phase(speeds, durations, keys, words):
+    """What ends in motion before its phase does, or before the others, is refused; what flies on to its end is not."""
+    ways = [
+        [_piece(T, [5.0 * i, 0.0, 10.0], [0.0, v, 0.0])]
+        for i, (v, T) in enumerate(zip(speeds, durations, strict=True))
+    ]
+    data = {
+        "schema_version": 1, "name": "two", "output_step": 0.05, "limits": {"tracking_error": 1e-3},
+        "agents": {"position": [[0.0, 0, 10], [5.0, 0, 10]], "mass": 1.0},
+        "phases": [{"kind": "follow", "trajectories": ways} | keys],
+    }  # fmt: skip
+    if words:
+        with pytest.raises(rf.MissionError, match=words):
+            rf.check(rf.Mission.from_dict(data))
+        return
+    assert rf.assess(rf.simulate(rf.Mission.from_dict(data))).passed
+
+
+@pytest.mark.parametrize(
+    ("until", "speed", "fits"), [(2.0, 1.0, True), (4.0, 1.0, False), (4.0, 0.5, True)]
+)
+def test_the_first_velocity_is_that_at_which_the_phase_flies(until, speed, fits):
+    """A file of two seconds that begins at 1 m/s begins at half of that in a phase that ends at four seconds."""
+    rows = [[2.0, *(0.0, 1.0), *(0.0, 0.0), *(10.0, 0.0), *(0.0, 0.0)]]
+    mission = rf.Mission.from_dict({
+        "schema_version": 1, "name": "one",
+        "agents": {"position": [[0.0, 0, 10]], "velocity": [[speed, 0, 0]], "mass": 1.0},
+        "phases": [{"kind": "follow", "trajectories": [rows], "until": until}],
+    })  # fmt: skip
+    if fits:
+        assert rf.check(mission).passed
+    else:
+        with pytest.raises(rf.MissionError, match=r"begins with a velocity 0\.50 m/s off"):
+            rf.check(mission)

@@ -26,7 +26,7 @@ from rigidfleet.kernel import (
     rigid_body,
 )
 from rigidfleet.kernel.compiler.cache import cache_directory
-from rigidfleet.kernel.engine import native, packing
+from rigidfleet.kernel.engine import build, native, packing
 from rigidfleet.kernel.engine.native import is_compiled
 from rigidfleet.kernel.problem import (
     EXACT,
@@ -819,6 +819,14 @@ def test_half_a_kernel_is_none(tmp_path, monkeypatch):
     file = native._cache_file("flight")
     file.write_bytes(file.read_bytes()[:-1])
     assert native._read_cached_code("flight") is None
+
+
+def test_functions_that_are_inlined_by_name_exist():
+    """Under another name a function is inlined no more, and nobody is told."""
+    files = Path(build.__file__).parents[1].rglob("*.py")
+    trees = [ast.parse(file.read_text("utf-8")) for file in files]
+    defined = {x.name for tree in trees for x in ast.walk(tree) if isinstance(x, ast.FunctionDef)}
+    assert {*build._HOT, *build._HOT_SAMPLED} <= defined
 
 
 @pytest.mark.long

@@ -5,6 +5,7 @@ import os
 import re
 import sqlite3
 import struct
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -202,7 +203,7 @@ def test_a_telemetry_log_has_the_clock_of_its_writer(log):
     late = own[:, 7] - (time + read.since)
     assert late.min() == pytest.approx(0.0, abs=1e-5)
     np.testing.assert_allclose(np.diff(time), np.diff(own[:, 6]) / 1e3, atol=1e-6)
-    assert said(read, "the clock begins anew, 2 times")
+    assert said(read, "the clock begins anew: the longest part counts")
     assert "armed" in read.read[0]
 
 
@@ -703,33 +704,86 @@ def test_recordings_are_packed_in_several_ways(tmp_path, packed, plugin):
         assert read.read[0]["rate_hz"] == pytest.approx(50.0)
 
 
-def test_a_frame_is_no_robot(tmp_path):
-    """Of a map, odometry in it, a robot in that and its wheel (REP 105), the robot is what moves."""
+def transforms_bag(folder: Path, rows: Callable[[int], list[tuple[str, str, float]]]) -> Path:
+    """A recording that `rosbags` writes, of 50 messages of transforms: frame, body, and x [m] of each."""
     rosbag2 = pytest.importorskip("rosbags.rosbag2")
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     of = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
     kind = of["TFMessage"].__msgtype__
-    with rosbag2.Writer(tmp_path / "bag", version=9) as writer:
+    with rosbag2.Writer(folder, version=9) as writer:
         to = writer.add_connection("/tf", kind, typestore=store)
         for k in range(50):
             moved = []
-            for frame, body, x in (
-                ("map", "odom", 0.01),
-                ("odom", "base_link", 0.1 * k),
-                ("base_link", "wheel", 0.2),
-            ):
+            for frame, body, x in rows(k):
                 header = of["Header"](of["Time"](1_700_000_000, 20_000_000 * k), frame)
                 transform = of["Transform"](
                     of["Vector3"](x, 0.0, 0.0), of["Quaternion"](0.0, 0.0, 0.0, 1.0)
                 )
                 moved.append(of["TransformStamped"](header, body, transform))
             writer.write(to, 20_000_000 * k, store.serialize_cdr(of["TFMessage"](moved), kind))
+    return folder
+
+
+def test_a_frame_is_no_robot(tmp_path):
+    """Of a map, odometry in it, a robot in that and its wheel (REP 105), the robot is what moves."""
+    transforms_bag(
+        tmp_path / "bag",
+        lambda k: [
+            ("map", "odom", 0.01),
+            ("odom", "base_link", 0.1 * k),
+            ("base_link", "wheel", 0.2),
+        ],
+    )
     read = read_trajectories(tmp_path / "bag")
     assert read.names == ("/tf:base_link",)
     np.testing.assert_allclose(at_samples(read)[1][:, 0], 0.1 * np.arange(50))
     assert read_trajectories(tmp_path / "bag", topic="/tf:odom").names == ("/tf:odom",)
+
+
+def test_robots_in_frames_of_their_own_are_not_compared(tmp_path):
+    """Frames of odometry that have a robot's name are no robots, and where one is in another is not known."""
+    path = transforms_bag(
+        tmp_path / "bag",
+        lambda k: [
+            (frame, body, x)
+            for who, at in (("cf1", 0.0), ("cf2", 7.0))
+            for frame, body, x in (
+                ("map", f"{who}/odom", at),
+                (f"{who}/odom", f"{who}/base", 0.1 * k),
+            )
+        ],
+    )
+    with pytest.raises(
+        TrajectoryError, match=r"in frames enu cf1/odom, enu cf2/odom: where .* --topic"
+    ):
+        read_trajectories(path)
+    read = read_trajectories(path, topic="/tf:cf?/base")
+    assert read.names == ("/tf:cf1/base", "/tf:cf2/base")
+    np.testing.assert_allclose(at_samples(read, 1)[1][:, 0], 0.1 * np.arange(50))
+
+
+def test_a_body_in_two_frames_is_in_the_first(tmp_path):
+    """Of a body that is tracked from the world and from a camera, places in the world count, and a note says so."""
+    path = transforms_bag(
+        tmp_path / "bag", lambda k: [("world", "cf1", 0.1 * k), ("camera", "cf1", 5.0 + 0.1 * k)]
+    )
+    read = read_trajectories(path)
+    np.testing.assert_allclose(at_samples(read)[1][:, 0], 0.1 * np.arange(50))
+    assert said(read, "/tf:cf1 in 'camera' is not read: it is in 'world' first")
+
+
+def test_where_vehicles_are_to_be_is_no_vehicle(tmp_path):
+    """Setpoints and goals are not judged as vehicles beside those that fly to them, unless they are named."""
+    at = [(1_700_000_000 * 10**9 + 20_000_000 * k, 0.01 * k) for k in range(50)]
+    topics = {"/cf1/pose": 0.0, "/cf1/setpoint": 0.2, "/goal_pose": 0.3, "/targets/cf2": 3.0}
+    rows = [(topic, t, t, [x + by, 0.0, 1.0]) for t, x in at for topic, by in topics.items()]
+    path = poses_bag(tmp_path / "bag", rows)
+    read = read_trajectories(path)
+    assert read.names == ("/cf1/pose", "/targets/cf2")
+    assert said(read, "topics that are not read: /cf1/setpoint, /goal_pose")
+    assert read_trajectories(path, topic="/goal_pose").names == ("/goal_pose",)
 
 
 @pytest.mark.parametrize(

@@ -967,6 +967,15 @@ def test_files_that_are_no_missions(tmp_path, content, problem):
     assert finding.remedy
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "latin-1"])
+def test_text_in_another_encoding_is_to_be_saved_anew(tmp_path, encoding):
+    """A mission in UTF-16, as PowerShell's > writes it, is one, and is to be saved as UTF-8."""
+    path = tmp_path / "mine.toml"
+    mark = b"\xfe\xff" if encoding == "utf-16-be" else b""
+    path.write_bytes(mark + "name = 'Zürich'".encode(encoding))
+    assert fails(load_mission, path).remedy == "save it as UTF-8"
+
+
 def test_paths_that_are_no_files(tmp_path):
     """A directory, an impossible name and an endless device are refused in a sentence."""
     assert "is a folder" in fails(load_mission, tmp_path).problem

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import rigidfleet as rf
+from rigidfleet import plotting
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import MissionError
 from rigidfleet.kernel import fleet
@@ -382,6 +383,8 @@ def test_a_result_has_what_its_links_did():
     assert "edges that let go for want of messages, first at 4.50 s: 1-2." in words + "."
     oldest = oldest_message_ages(result)
     assert oldest[out, 0].min() > oldest[out, 2].max()
+    assert "messages" in plotting.figure_names(result)
+    assert plotting.messages(result).axes[0].get_ylabel() == "oldest message [s]"
 
 
 def test_live_flying_loses_messages():

@@ -774,7 +774,7 @@ def test_an_executor_that_dies_is_a_sentence(flown, tmp_path, monkeypatch, capsy
         fly(asked, tmp_path, pool=pool, workers=1)
     done = len(read(tmp_path).run)
     assert str(caught.value) == (
-        "workers died in the middle of runs. If memory is short, use fewer of them."
+        "workers died. If memory is short, use fewer of them; a script needs `if __name__ == '__main__':`."
         f" {tmp_path}: {done} of 20 runs are saved; the same command goes on."
     )
     warned = [r.message for r in caplog.records if r.levelno == logging.WARNING]

@@ -225,7 +225,7 @@ def test_study(study):
     assert tuned.after.mean("shape_tracked") >= min(errors)
     assert tuned.validation is not None
     mission = rf.load_mission(folder / "pair-tuned.toml").to_dict()
-    for k, error in enumerate(tuned.validation[0 if tuned.worse else 1].values["shape_tracked"]):
+    for k, error in enumerate(tuned.validation[0 if tuned.is_worse else 1].values["shape_tracked"]):
         mission["disturbances"]["noise"]["seed"] = 2 + k
         result = rf.simulate(rf.Mission.from_dict(mission))
         tracked = np.isfinite(result.slot_position).all(axis=(1, 2))

@@ -37,6 +37,7 @@ _WORDS = {
     "none": "std var cov covariance err error sigma noise rate offset min max mean limit size scale omega angular "
             "gyro mag torque force thrust gyr ang euler rpy bias w b",
     "wanted": "ref reference setpoint sp target desired des cmd command goal",
+    "source": "true truth gt groundtruth est estimated meas measured actual raw filtered ekf kf",
     "time": "t time timestamp stamp sec secs second seconds elapsed datetime nsec nsecs nanosec clock",
     "time too": "header sim field ros utc unix epoch date since start relative rel log of posix world in boot",
     "agent": "agent drone vehicle uav uas robot cf crazyflie quad quadrotor quadcopter copter aircraft plane body "
@@ -53,8 +54,12 @@ _IS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
 _ABBREVIATED = {"pos": "", "p": "", "t": "", "vel": "v", "acc": "a"}
 #: Variables of Crazyflie's logs, by which cfclient names columns beside times in milliseconds: in m or mm, and degrees.
 CRAZYFLIE = re.compile(r"stateEstimate(Z?)\.(v?)([xyz]|yaw)")
+#: Words for places that are wanted.
+WANTED = _IS["wanted"]
+#: Words by which places of one vehicle differ, where several have no other name.
+SOURCES = _IS["source"]
 #: Words for places that are wanted, or for no places, beside those of a vehicle.
-ROLES = _IS["none"] - {"w", "b"} | _IS["wanted"]
+ROLES = _IS["none"] - {"w", "b"} | WANTED
 #: A letter alone, and what a quantity is nothing without: an acceleration without a velocity, ...
 _LETTER, _AFTER = r"(?<![^\W_])[a-z]\d*(?![^\W_])", {"a": "vx", "j": "ax", "q": "qw"}
 _HUES = {"r": "red", "g": "green", "b": "blue"}

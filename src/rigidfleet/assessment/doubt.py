@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.quantities import quantity
+from rigidfleet._common.text import first_few
 from rigidfleet.assessment.alignment import Alignment
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import CheckResult, Verdict, keeps_limit, value
@@ -50,6 +51,8 @@ _APPLIED = {
     "recorded": "clocks count as recorded (--clock offset takes it out)", "offset": "that is taken out",
     "own": "each vehicle's own offset is taken out, and separation is not judged",
 }  # fmt: skip
+#: Samples by which slots are matched with vehicles; a share of the distances as judged that is less by another order.
+_SAMPLES, _NEARER = 20, 0.5
 #: Time about a reset of an estimator in which a smoothed way is not what was flown [s].
 _RESET = 1.0
 #: Pairs and times that may be nearest, of which so many are compared, and distances that are computed together.
@@ -105,7 +108,7 @@ class DrawnWays:
         if values is None or values.shape != sizes.shape[1:]:
             return most
         # Only what is near the worst value may be the worst in truth.
-        return float(sizes[:, values >= q.rank(check.worst) - 2.0 * most].max(initial=0.0))
+        return _greatest(sizes[:, values >= q.rank(check.worst) - 2.0 * most])
 
     def _near_pairs(self, reach: float) -> tuple[Ints, Ints, Ints]:
         """Samples and pairs whose surfaces are nearer than a distance: the nearest ones, if they are many."""
@@ -125,7 +128,13 @@ def _norms(x: Floats) -> Floats:
 
 
 def _greatest_norm(x: Floats) -> float:
-    return float(_norms(x).max(initial=0.0))
+    return _greatest(_norms(x))
+
+
+def _greatest(sizes: Floats) -> float:
+    """How great lengths (S, ...) of deviations of S ways drawn may be: so few ways alone do not reach what is rare."""
+    squares = float(np.einsum("s...,s...->...", sizes, sizes).max(initial=0.0))
+    return max(float(sizes.max(initial=0.0)), _SURE * math.sqrt(squares / (3 * len(sizes))))
 
 
 def _quantity_name(check: CheckResult) -> str:
@@ -192,7 +201,9 @@ def _with_interval(check: CheckResult, by: float, sigma: float) -> CheckResult:
     if not keeps_limit(sense, better, limit):
         return replace(check, passed=False)
     # The interval is then to be shorter than the way to the limit, which another log finds a little nearer.
-    less = (_SHORTER * abs(worst - limit) / by) ** (1.0 / _POWERS[_derivative_order(check)])
+    # All of what is there may be noise, which then is less, too.
+    share = min(abs(worst - limit) / by, limit / high if low == 0.0 else math.inf)
+    less = (_SHORTER * share) ** (1.0 / _POWERS[_derivative_order(check)])
     remedy = f"noise of {value(1e3 * sigma * math.sqrt(less))} mm would decide it"
     if less * _TIMES > 1.0:
         remedy += f", or, if it is white, {math.ceil(1.0 / less)} times the rate"
@@ -221,12 +232,19 @@ def uncertainty_facts(
         facts["resets_s"] = resets
     if alignment is None:
         return facts
+    from scipy.optimize import linear_sum_assignment
+
     off = np.where(flown.left[..., None], flown.position - flown.slot_position, np.nan)
     mean, far = np.nanmean(off, axis=0), np.nan_to_num(np.linalg.norm(off, axis=2))
     worst, each = far.argmax(axis=0), np.arange(flown.n_agents)
     shifts = np.full((1, 1, *mean.shape), np.nan) if deviations is None else deviations.states[:, 0]
     by = np.linalg.norm(shifts.mean(axis=1), axis=2).max(axis=0)
     size = np.linalg.norm(mean, axis=1)
+    places = np.nan_to_num([flown.position, flown.slot_position])[:, :: -(-len(off) // _SAMPLES)]
+    p, slots = places.swapaxes(1, 2).reshape(2, len(each), -1)
+    order = linear_sum_assignment(-(p @ slots.T))[1]
+    if np.sum((p - slots[order]) ** 2) < _NEARER**2 * np.sum((p - slots) ** 2):
+        facts["order"] = (order + 1).tolist()
     aside = size - np.nan_to_num(by) > np.maximum(_OFF, 2.0 * np.median(size) * (len(size) > 1))
     columns = {
         "name": flown.statistics["names"], "mean_off_m": size, "mean_error_m": by, "mean_off_xyz_m": mean,
@@ -274,13 +292,17 @@ def doubt_notes(facts: dict[str, Any]) -> Iterator[str]:
         judged = f"It is judged as flown, {far} off (root mean square)"
         causes = f"against the plan the log is {' and '.join(parts)}"
         yield f"{causes}. {judged}; without clock and set-up, {left} are left"
+    if order := facts.get("order"):
+        names = first_few([each["name"] for each in facts["vehicles"]])
+        where = f"where agents {first_few(order)} are to be: the log may have another order"
+        yield f"{names} count as agents from 1 on, but are {where}"
     for each in facts["vehicles"]:
         if each["off_its_slot"]:
             off, by = 1e3 * each["mean_off_m"], 1e3 * np.nan_to_num(each["mean_error_m"])
             x, y, z = (value(1e3 * x) for x in each["mean_off_xyz_m"])
             peak = f"{value(1e3 * each['worst_off_m'], 'mm')} at {each['worst_at_s']:.2f} s"
             yield f"{each['name']!r} is {_with_error(off, by)} mm off its slot on average, ({x}, {y}, {z}), and {peak}"
-        if each["late"]:
+        if each["late"] and facts["clock"] != "own":  # then all are told at once
             yield f"{each['name']!r} is {_lateness_in_words(*each['offset_s'])} by itself: its clock, or its tracking"
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import DIRECTIONS, ROLES, meaning_of, unit_of
+from rigidfleet._common.names import DIRECTIONS, ROLES, SOURCES, meaning_of, unit_of
 from rigidfleet._common.tables import (
     DEFAULT,
     SEPARATORS,
@@ -255,6 +255,8 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
     flown = {"": sets[""]} if "" in sets else flown
     if not flown:
         raise table.missing_columns_error(*"xyz")
+    if len(flown) > 1 and flown.keys() <= SOURCES:
+        raise fault(f"has several places of one vehicle: {', '.join(flown)}", "Keep one of them")
     main = next(iter(flown))
     for who in loose.keys() - flown.keys():
         names = ", ".join(table.names[k] for k in loose[who].values())
@@ -443,5 +445,8 @@ def _doubts_about_units(table: TextTable, tracks: list[Track], *, axes: bool) ->
     moves = max(map(np.sum, ways)) > _SLOW and float(np.median(steps)) >= _LONG
     if fastest > _FAST or (moves and fastest < _SLOW and not table.units["time"][1]):
         remedy = "Name columns such as time_ms and x_mm, or say --units ms or s, mm or m"
-        note = Doubt(f"{note}, so that speeds reach {fastest:.3g} m/s. {remedy}")
+        note = f"{note}, so that speeds reach {fastest:.3g} m/s"
+        if fastest > _FAST:
+            raise fault(note, remedy)
+        note = Doubt(f"{note}. {remedy}")
     yield note

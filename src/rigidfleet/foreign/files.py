@@ -38,7 +38,7 @@ _NOTES = 10
 _ZIP = b"PK"
 #: What is not read, by its first bytes, and what to do with it.
 _REFUSED = {
-    b"\x89HDF": "is a result of `rigidfleet run`. Give it alone: `rigidfleet assess FILE.nc`",
+    b"\x89HDF": "is HDF5. Give a result of `rigidfleet run` alone, and any other data as CSV",
     b"#ROSBAG": "is of ROS 1. Convert it: pip install rosbags; rosbags-convert --src {} --dst FOLDER",
     poses.ZSTANDARD: "is compressed as a whole. Unpack it: zstd -d {}",
 }

@@ -235,14 +235,14 @@ def trajectories_of(
     seconds = lambda time: (time - first) / 1e9 + (first - zero) / 1e9  # noqa: E731  # whole numbers lose none
     samples = [(seconds(x.time), x.place, x.yaw) for x in every]
     curves = [curve_through_samples(*own, interpolation, str) for own in samples]
+    frames = {track.frame if track.origin is None else "geodetic" for track in every}
+    if len(frames) > 1 and not topics:
+        words = f"positions are in frames {first_few(sorted(frames))}: where one is in another is not known"
+        raise fault(words, "Name topics of one frame: --topic")
     if not topics and all(who == track.topic for who, track in tracks.items()):
         _refuse_duplicates([*tracks], curves)
-    frames = [*dict.fromkeys(track.frame for track in every)]
-    if len(frames) > 1:
-        words = ", ".join(frames[:_LISTED])
-        notes[f"positions are in frames {words}: where one is in another is not known"] = [""]
     record: dict[str, Any] = {
-        "topics": [*dict.fromkeys(track.topic for track in every)][:20], "frame": frames[0],
+        "topics": [*dict.fromkeys(track.topic for track in every)][:20], "frame": next(iter(every)).frame,
         "clock": log.clock or "the vehicle's own, from its start", "since_1970_ns": zero or None,
         "rows": sum(len(track.time) for track in every),
     }  # fmt: skip
@@ -378,7 +378,7 @@ def _increasing_rows(time: Any, rows: Ints, notes: list[str]) -> Ints:
     if len(parts) > 1:
         every, rows = len(rows), max(parts, key=len)
         words = f"the longest part counts, {len(rows):,} of {every:,} samples"
-        notes.append(f"the clock begins anew, {len(parts) - 1} times: {words}")
+        notes.append(f"the clock begins anew: {words}")
     later = np.append(True, time[rows][1:] > np.maximum.accumulate(time[rows])[:-1])
     if not later.all():
         notes.append(f"{np.sum(~later):,} samples whose times repeat or go back are left out")

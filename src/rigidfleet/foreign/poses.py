@@ -26,6 +26,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from rigidfleet._common.names import WANTED
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.foreign.columns import yaws_of
 from rigidfleet.foreign.logs import DAMAGED, FORMS, Channel, Log, channel_of_px4, choose_channels
@@ -33,8 +34,9 @@ from rigidfleet.foreign.logs import DAMAGED, FORMS, Channel, Log, channel_of_px4
 #: How recordings begin, and what Zstandard packed.
 MCAP, SQLITE, ZSTANDARD = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 _BILLION = 1_000_000_000
-#: Frames of REP 105 in which robots move; that of odometry moves in the map itself.
-_FRAMES = {"map", "odom"}
+#: Frames of REP 105 in which robots move, perhaps each in its own; that of odometry moves in the map itself. And words
+#: for places that a robot is to reach.
+_NO_VEHICLE = re.compile(rf":(.*/)?(map|odom)$|(?<![a-z])({'|'.join(sorted(WANTED))})(?![a-z])")
 #: Greatest size of a chunk of a recording when it is unpacked, and of a message [bytes].
 _CHUNK, _MESSAGE = 32 << 20, 1 << 20
 #: What no position [m] or quaternion reaches.
@@ -87,6 +89,9 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         for each in chain.from_iterable(_read_positions(path, unread) for path in paths):
             topic, first, stamp, received, numbers = each
             own = rows.setdefault(topic, _Rows(*first, array("q"), array("q"), array("d")))
+            if own.frame != first[2]:
+                unread[f"{topic} in {first[2]!r}"] = f"is in {own.frame!r} first"
+                continue
             own.stamps.append(stamp)
             own.received.append(received)
             own.numbers.extend(numbers)
@@ -110,9 +115,9 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         chosen = [c for c in chosen if c not in undated]
     if not topics:
         chosen = [c for c in chosen if c.message == chosen[0].message]
-        bodies = {c.topic.partition(":")[2] for c in chosen if c.message == "TFMessage"} - _FRAMES
-        # What moves in a body is a part of it, and what a robot moves in is no robot.
-        moving = [c for c in chosen if c.topic.partition(":")[2] not in _FRAMES]
+        # What moves in a body is a part of it; what a robot moves in, or is to reach, is no robot.
+        moving = [c for c in chosen if not _NO_VEHICLE.search(c.topic.lower())]
+        bodies = {c.topic.partition(":")[2] for c in moving if c.message == "TFMessage"}
         chosen = [c for c in moving or chosen if c.frame not in bodies]
         if others := sorted({c.topic for c in channels} - {c.topic for c in chosen})[:5]:
             notes.append(f"topics that are not read: {', '.join(others)}; --topic may name them")

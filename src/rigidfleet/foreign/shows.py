@@ -96,7 +96,7 @@ def _read_json(archive: _Archive, entry: str) -> Any:
     try:
         size = archive.getinfo(entry).file_size
     except KeyError:
-        raise fault(f"has no {entry}", "Is it a show of Skybrush?") from None
+        raise fault(f"has no {entry}", "Is it a show of Skybrush? Save tables as CSV") from None
     archive.room -= size
     if archive.room < 0:
         raise fault(f"{entry}: drones refer to it too often", "Give each an entry of its own")

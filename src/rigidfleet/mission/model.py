@@ -82,8 +82,6 @@ def _compute_once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
 
 #: Vehicles no higher above what is below them stand on it [m].
 _STANDING = 0.5
-#: The most vehicles of which it is said where they land.
-_LISTED = 60
 
 
 @with_earlier_names(linked="has_link", free_attitude="leaves_attitude_free")
@@ -512,7 +510,7 @@ class Mission(Contents, Shown):
 
         near = KDTree(start[:, :2]).query(end[:, :2])[1]
         others = np.flatnonzero(stand & (near != np.arange(len(end))))
-        who = first_few([f"{i + 1} where {near[i] + 1} did" for i in others], _LISTED)
+        who = first_few([f"{i + 1} where {near[i] + 1} did" for i in others])
         words = f"{len(others)} of {len(end)} vehicles land where another one stood: {who}"
         return words if others.size else ""
 

@@ -11,8 +11,9 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import toml_key
-from rigidfleet.foreign.curves import CHANNELS, greatest_jumps, rows_to_curve
+from rigidfleet.foreign.curves import CHANNELS, greatest_jumps
 from rigidfleet.formation import distance_geometry
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys, suggest
@@ -351,18 +352,28 @@ def _follow_rules(m: Draft, p: Follow, k: int, longest: float | None) -> Breache
             remedy = "make all rows of one length: 1 + 4 P numbers"
             yield Breach(("trajectories", i), problem, remedy, None)
             return
-        by, when = greatest_jumps(rows_to_curve(rows))
+    try:
+        way = p.pieces
+    except ValueError as error:
+        remedy = "give all vehicles the same times, or fewer"
+        yield Breach("trajectories", str(error), remedy, None)
+        return
+    for i in range(count):  # one that ends before the others stays where it ends
+        by, when = greatest_jumps(Piecewise(way.time, way.pieces[:, i]))
         for far, t, (most, unit) in zip(by.tolist(), when.tolist(), _JUMPS, strict=False):
             if far > most:
                 problem = f"jumps by {far:.3g} {unit} at {t:.6g} s"
                 remedy = f"correct it: at most {most:g} {unit} is taken for rounding"
                 yield Breach(("trajectories", i), problem, remedy, None)
                 return
-    try:
-        _ = p.pieces
-    except ValueError as error:
-        remedy = "give all vehicles the same times, or fewer"
-        yield Breach("trajectories", str(error), remedy, None)
+    if p.travel and p.settle is None and longest is not None and longest > p.travel * (1 + 1e-9):
+        # Beyond the file the body goes on as it ends, and the vehicles rest beside each other.
+        v = way.states(way.time[-1:], 2)[1, 0, :, :3] * (way.time[-1] / p.travel)
+        speed = np.linalg.norm(v - v.mean(axis=0), axis=1)
+        if (most := speed.max()) > _JUMPS[1][0]:
+            who = f"agent {speed.argmax() + 1} goes on at {most:.2f} m/s beside the others"
+            remedy = "let the trajectories end at rest, or the phase with them"
+            yield Breach("travel", f"ends before the phase, while {who}", remedy, p.travel)
 
 
 def _reshape_rules(m: Draft, p: Reshape, k: int, _: float | None) -> Breaches:

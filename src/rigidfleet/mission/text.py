@@ -81,7 +81,8 @@ def read_text(path: str | Path) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        remedy = remedy if b"\0" in data else "save it as UTF-8"
+        text = data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" not in data  # marks of UTF-16
+        remedy = "save it as UTF-8" if text else remedy
         raise text_error(origin, f"is not UTF-8 text (byte {error.start + 1})", remedy) from None
 
 

@@ -445,6 +445,7 @@ class Aborts:
         """
         limits, left, radius = self.mission.limits, self.left, self.radius[self.left]
         along = step.path is not None
+        astray = 0.0 if along else 0.5 * step.off  # how far each may be off its way in flight
         way, on = step.way, f"on the way {step.name}"
         if not along and (apart := step.least.separation - step.off) < max(self.need, 1e-6):
             # On their pads vehicles may be nearer.
@@ -463,10 +464,10 @@ class Aborts:
         r = way.at(time)[:, left]
         if limits.geofence is not None and not along:
             low, high = (np.array(x) for x in (limits.geofence.min, limits.geofence.max))
-            out = np.maximum(low - r, r - high).max(axis=2) + radius
+            out = np.maximum(low + astray * _ABOVE - r, r + astray - high).max(axis=2) + radius
             k, i = np.unravel_index(int(out.argmax()), out.shape)
             if out[k, i] > 1e-6:
-                return f"agent {left[i] + 1} leaves the geofence by {out[k, i]:.2f} m {on}"
+                return f"agent {left[i] + 1} may leave the geofence by {out[k, i]:.2f} m {on}"
         if limits.separation_below is not None and len(left) > 1 and not along:
             height, pair = proximity.headroom(r, radius)
             k = int(height.argmin())
@@ -479,7 +480,7 @@ class Aborts:
         for name, x in watch.search().items():
             q = QUANTITIES[name]
             limit, place = q.limit_of(self.mission), getattr(self.mission, PLACES[q.who])[x.other].name  # fmt: skip
-            if limit is not None and q.rank(x.value) > q.rank(limit) + 1e-6:
+            if limit is not None and q.rank(x.value) > q.rank(limit) + 1e-6 - astray:
                 words = boundary_in_words(name, f"agent {x.who + 1}", place, x.value, begin + x.time)  # fmt: skip
                 return f"{words}, {on}"
         if step.lands:

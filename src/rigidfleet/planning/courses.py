@@ -169,7 +169,8 @@ def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) 
 def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> Course:
     """Follow the trajectory of the virtual body, or the mean of the vehicles' own, about which the slots then move.
 
-    What the first point of a file differs from the place where the vehicles are fades over `_FADED`.
+    What the first point of a file differs from the place where the vehicles are fades over `_FADED`; more, as avoidance
+    may leave, over longer, so that its acceleration stays.
     """
     pose, before, slots = now.pose_goal_slots
     way = phase.pieces
@@ -180,7 +181,9 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
     begin = np.concatenate(
         [np.stack([pose.r, pose.v, pose.a, pose.jerk]), rotation_to_pose(pose, T1)], 1
     )
-    lift, fade = None, min(_FADED, float(knots[-1]))
+    place = pose.r + (slots @ pose.T if pieces.shape[1] > 1 else 0.0)
+    off = float(np.linalg.norm(pieces[0, :, :3, 0] - place, axis=1).max()) / _START_TOLERANCES[0]
+    lift, fade = None, min(_FADED * math.sqrt(max(off, 1.0)), float(knots[-1]))
     body = np.zeros((len(pieces), 6, pieces.shape[-1]))
     if pieces.shape[1] == 1:
         body[:, :3] = pieces[:, 0, :3]
@@ -225,7 +228,7 @@ def slot_motion_conflict_text(phase: Any, now: PhaseState) -> str:
 
 def way_conflict_text(phase: Any, now: PhaseState) -> str:
     """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
-    if phase.bent:
+    if phase.has_bent_ways:
         first = np.array(phase.control_points)[0]
         if now.slots is None or not np.abs(first - now.slots).max() < _START_TOLERANCES[0]:
             return "begins in other slots than the phase before has led to"
@@ -244,7 +247,8 @@ def _trajectory_conflict_text(phase: Follow, now: PhaseState) -> str:
     speed = pose.v[None] + (0.0 if alone else np.cross(pose.omega, now.slots) @ pose.T)
     if now.rates is not None and not alone:
         speed = speed + now.rates[0] @ pose.T
-    length = phase.travel or (phase.duration if isinstance(phase.duration, float) else knots[-1])
+    known = phase.travel or phase.duration or (phase.until or 0.0) - now.t
+    length = knots[-1] if phase.auto_keys else known
     missed = first[..., 0] - place, first[..., 1] * (knots[-1] / length) - speed
     off = np.linalg.norm(missed, axis=2)
     for far, most, unit in zip(off, _START_TOLERANCES, ("m", "m/s"), strict=False):

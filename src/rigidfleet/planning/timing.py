@@ -109,8 +109,12 @@ def complete_times(mission: Mission) -> Mission:
     return mission.with_phases(tables)
 
 
-def timed_leg(mission: Mission, phase: Phase, now: PhaseState, number: int) -> Leg:
+def timed_leg(
+    mission: Mission, phase: Phase, now: PhaseState, number: int, *, anywhere: bool = False
+) -> Leg:
     """The leg of a phase from a state at its start, with the least times in place of its automatic ones.
+
+    With ``anywhere``, ways that are given may begin elsewhere than the vehicles are.
 
     Raises
     ------
@@ -118,7 +122,7 @@ def timed_leg(mission: Mission, phase: Phase, now: PhaseState, number: int) -> L
         No time keeps the limits, or the phase follows given ways that begin elsewhere.
     """
     departure = depart(mission, phase, now)
-    if problem := way_conflict_text(phase, departure.now):
+    if not anywhere and (problem := way_conflict_text(phase, departure.now)):
         key = "file" if phase.follows_curves else "formation"
         remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
         raise ways.error_of_key(mission, number, key, None, problem, remedy)

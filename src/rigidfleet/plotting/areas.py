@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 PEOPLE = "#6A3D9A"
 #: Line of a soft fence.
 _SOFT = 0, (4, 2)
-#: Colour of places where vehicles fall; the most places of a kind that are drawn, and areas that a legend names.
-_FALLS, _MOST, _NAMED = "#E69F00", 4000, 6
+#: Colour of places where vehicles fall; the most places of a kind that are drawn.
+_FALLS, _MOST = "#E69F00", 4000
 
 
 def drawn_areas(mission: Mission) -> list[tuple[str, list[Floats], dict[str, Any]]]:
@@ -88,8 +88,10 @@ def draw_ground(result: Result, falls: Floats) -> Figure:
         flat = places[result.left]
         ax.plot(*flat[:: 1 + len(flat) // _MOST].T, ".", markersize=2, color=colour, zorder=2)
         handles.append(st.legend_entry(what, linestyle="", marker="o", markersize=5, color=colour))
-    for name, _, look in drawn_areas(result.mission)[:_NAMED]:
-        handles.append(Patch(label=st.clean_name(name), **look))
+    drawn = drawn_areas(result.mission)
+    for look in {str(look): look for *_, look in drawn}.values():
+        names = ", ".join(name for name, _, other in drawn if other == look)
+        handles.append(Patch(label=st.clean_name(names), **look))
     ax.set(xlabel="x, east [m]", ylabel="y, north [m]")
     ax.margins(0.06)
     ax.set_aspect("equal", adjustable="box")

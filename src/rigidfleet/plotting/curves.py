@@ -125,6 +125,7 @@ def draw_distances(ax: Axes, result: Result) -> None:
         wanted = np.column_stack([np.fmin.reduce(wanted, axis=1), np.fmax.reduce(wanted, axis=1)])
     for k in _distinct_columns(wanted):
         st.draw_reference(ax, result.time, wanted[:, k])
+    _widen_limits(ax, 0.1)
 
 
 def _distinct_columns(values: Floats) -> list[int]:

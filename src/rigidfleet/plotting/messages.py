@@ -19,7 +19,8 @@ _DIVERGES = 1e4
 
 
 @st.figure_of(
-    lambda result: np.size(result.message_age or ()), "no network: one law knows all states"
+    lambda result: result.message_age is not None and result.message_age.size,
+    "no network: one law knows all states",
 )
 def messages(result: Result) -> Figure:
     """Age of the oldest message that each vehicle goes by, and the force by which the group pushes itself."""

@@ -298,11 +298,11 @@ def draw_trajectory_from_above(ax: Axes, result: Result, view: Scene) -> None:
     ax.add_collection(LineCollection(list(edges), colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 2)
     for names, (x, y, _) in _waypoint_names_by_place(view, 2):
-        side, away = (
-            ("right", -5) if x > view.high[0] - 0.2 * np.ptp(ax.get_xlim()) else ("left", 5)
+        name = ax.annotate(
+            names, (x, y), (5, 4), textcoords="offset points", **_waypoint_name_look(result)
         )
-        look = {"textcoords": "offset points", "ha": side, **_waypoint_name_look(result)}
-        ax.annotate(names, (x, y), (away, 4), **look)
+        beyond = max(name.get_window_extent().x1 - ax.bbox.x1, 0.0)
+        name.set_position((5 - 72 * beyond / ax.figure.dpi, 4))
 
 
 def trajectory_handles(result: Result, view: Scene) -> list[Any]:

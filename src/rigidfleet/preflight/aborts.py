@@ -120,8 +120,9 @@ class AbortsCheck(Shown):
         homes = {x.home.number: x.home.steps for x in self.aborts if x.home.number is not None}
         keys = ("ordered_s", "begins_s", "waits_s", "stops_s", "ways")
         aborts = [{key: x[key] for key in keys} for x in data["aborts"] if x["way"]]
-        tables = {"aborts.json": data}
-        for i in range(self.mission.n_agents):
+        tables, n = {"aborts.json": data}, self.mission.n_agents
+        leavers = self.mission.aborting.agents or range(1, n + 1)
+        for i in range(n):
             ways = {
                 number: [
                     {"name": x.name, "duration_s": x.duration, "to_m": x.end[i].round(6).tolist()}
@@ -129,8 +130,10 @@ class AbortsCheck(Shown):
                     for x in steps
                 ]
                 for number, steps in homes.items()
+                if i + 1 in leavers
             }
-            tables[f"vehicle-{i + 1:04d}.json"] = {"vehicle": i + 1, "aborts": aborts, "ways": ways}
+            own = [x | {"ways": x["ways"] if x["ways"] in ways else None} for x in aborts]
+            tables[f"vehicle-{i + 1:04d}.json"] = {"vehicle": i + 1, "aborts": own, "ways": ways}
         for name, table in tables.items():
             write_file(folder / name, (json.dumps(table, indent=1) + "\n").encode())
 

@@ -39,16 +39,16 @@ def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         yield Remark("note", "loss", text)
         return
     way, problem, _ = planned_answer_to_loss(mission, at, legs)
-    end = way[-1].end
     does = "hold to" if mission.on_loss == "hold" or problem else "land by"
-    stop = way[0].planned_end_state.r.mean(axis=0)
-    place = ", ".join(f"{x:.1f}" for x in stop)
     what = "the order to abort" if ordered else f"the loss of {mission.first_lost}"
     if problem:
         yield Remark("fails", "loss", f"no way home is proved after {what}: {problem}")
+    if not way:  # nobody leaves the plan
+        return
+    place = ", ".join(f"{x:.1f}" for x in way[0].planned_end_state.r.mean(axis=0))
     text = (
         f"after {what} at {first:g} s, in '{at.phase.name}', the others brake to rest about"
-        f" ({place}) m by {way[0].end:.1f} s, and {does} {end:.1f} s"
+        f" ({place}) m by {way[0].end:.1f} s, and {does} {way[-1].end:.1f} s"
     )
     yield Remark("note", "loss", text)
     most = max(samples_per_phase(mission), FEWEST_SAMPLES)

@@ -123,12 +123,14 @@ def _likely_flight(
         logs = [log._replace(time=log.time - by) for log, by in zip(logs, every, strict=True)]
         if offsets.any():
             smoothed = _smooth_ways(logs, noise)
-    # Beside a plan, a sample counts a usual step beyond it, by part of which clocks may be off.
+    # Beside a plan, a sample counts a step beyond it, as others are lost, and by part of which clocks may be off.
     ends = np.array([log.time[[0, -1]] for log in logs])
-    if planned is not None:
-        ends += np.array([[-1.0, 1.0]]) * [[np.median(np.diff(log.time))] for log in logs]
+    if plan is not None:
+        ends += np.array([[-1.0, 1.0]]) * [[np.quantile(np.diff(log.time), 0.95)] for log in logs]
     each = zip(smoothed, ends.tolist(), strict=True)
     whole = join_curves([own.way.between(*end) for own, end in each])
+    if plan is not None:
+        ends[:, 1] = np.minimum(ends[:, 1], plan.mission.lost_at)
     spans = ends.tolist() if read.away and np.ptp(ends, axis=0).any() else []
     if plan is None or planned is None:
         blank = Piecewise(whole.time, np.full((*whole.pieces.shape[:2], 1, 1), np.nan))
@@ -203,7 +205,7 @@ def _clock_offsets(alignment: Alignment, clock: Clock) -> Floats:
         return np.zeros((2, 1))
     offsets = np.where(np.isnan(alignment.own), every, alignment.own) if clock == "own" else every
     if np.isnan(offsets).any():
-        why = "the clock cannot be told: the plan hardly moves, or the log is not of it"
+        why = "the clock cannot be told: the plan hardly moves, noise hides it, or the log is not of it"
         raise TrajectoryError(f"{why}. Give logs of one clock, with --clock recorded.")
     return offsets
 
@@ -259,11 +261,15 @@ def flight_of_plan(plan: Result, planned: Piecewise, way: Piecewise, spans: list
     every = {name: getattr(plan, name) for name in _PLANNED}
     known: dict[str, Any] = {name: x[inside] for name, x in every.items() if x is not None}
     (r, v, a), slots = way.states(time, 3), planned.states(time, 3)[..., :3]
-    share, (i, j) = mission.fleet.mass / mission.fleet.mass.sum(), plan.edges.T
+    mass, (i, j) = mission.fleet.mass * (time[:, None] <= mission.lost_at), plan.edges.T
+    mass /= mass.sum(axis=1, keepdims=True)
+    # What vehicles that are left are off their planned places moves the centre.
+    off = np.einsum("kn,skna->ska", mass, [r - plan.position[inside], v - plan.velocity[inside]])
     length = np.linalg.norm(r[:, i] - r[:, j], axis=2)
     known |= {
         "edges": plan.edges, "position": r, "velocity": v, "acceleration": a, "slot_position": slots[0],
-        "slot_velocity": slots[1], "slot_acceleration": slots[2], "cm": share @ r, "cm_velocity": share @ v,
+        "slot_velocity": slots[1], "slot_acceleration": slots[2], "cm": plan.cm[inside] + off[0],
+        "cm_velocity": plan.cm_velocity[inside] + off[1],
         "distance": length, "constraint": length - known["distance_reference"],
     }  # fmt: skip
     whole = end >= plan.time[-1] - 1e-6

@@ -39,6 +39,7 @@ from rigidfleet.simulation.callbacks import (
     RotorCommand,
 )
 from rigidfleet.simulation.extremes import Extremes
+from rigidfleet.simulation.leading import layers
 from rigidfleet.simulation.own_laws import Law
 from rigidfleet.simulation.point_phase import PointPhase
 from rigidfleet.simulation.recording import Piece, assemble_result
@@ -384,7 +385,9 @@ class Flight:
         if self._phases_begun:
             self._report_progress(phase, planning=True)
         try:
-            leg = timed_leg(self.mission, phase, self._state_now, len(self._phases_begun))
+            where = self._state_now, len(self._phases_begun)
+            evades = not by_hand and layers(self.mission) is not None  # and may be beside the plan
+            leg = timed_leg(self.mission, phase, *where, anywhere=evades)
             plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
             self._check_not_flipped(plan)

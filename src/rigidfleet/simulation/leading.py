@@ -57,12 +57,15 @@ _BESIDE = 1e-9
 
 
 def layers(mission: Mission) -> Settings | None:
-    """The settings of [avoidance], if its clock or its body layer can act: obstacles move, and no vehicle is lost."""
+    """The settings of [avoidance], if its clock or its body layer can act.
+
+    They can if obstacles move, no vehicle is lost, and no abort leaves the plan, of which all that follows is proved.
+    """
     settings, d = mission.avoidance, mission.disturbances
     if settings is None or not (settings.clock or settings.body):
         return None
-    lost = d is not None and bool(d.lost)
-    return None if lost or not any(o.solid.moves for o in mission.obstacles) else settings
+    leaves = (d is not None and bool(d.lost)) or mission.abandons_at < np.inf
+    return None if leaves or not any(o.solid.moves for o in mission.obstacles) else settings
 
 
 class LeaderState(NamedTuple):

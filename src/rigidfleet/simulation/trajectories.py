@@ -425,6 +425,8 @@ def watch_curve(
         block = curve.slice_pieces(k, k + together)
         way = Piecewise(block.time, pad(block.pieces[:, :, :3], 2))
         _watch_positions(watch, way, grid, spans)
+        here = presence(0.5 * (way.time[1:] + way.time[:-1]), spans, way.pieces.shape[1])
+        way = Piecewise(way.time, way.pieces * here[..., None, None])
         _take_accelerations(fastest, way, directed=watch.directed)
     return fastest
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from rigidfleet._common.quantities import MOTIONS
+from rigidfleet._common.text import first_few
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.math import proximity
 from rigidfleet.math.piecewise import Piecewise, common_knots, join_curves, pad, piece_index
@@ -249,7 +250,12 @@ class Show:
                 raise RigidfleetError(
                     f"{files[0]}: has {len(read.curves)} vehicles, and the show {self.n}. Give a file of each."
                 )
-            if {*read.names} == {*self.names}:
+            strange = sorted({*read.names} - {*self.names})
+            if 0 < len(strange) < self.n:  # where some names agree, they say whose a file is
+                raise RigidfleetError(
+                    f"{files[0]}: has {first_few(strange)}, and the show has not. Name the vehicles of both alike."
+                )
+            if not strange and self.names:
                 order = [read.names.index(name) for name in self.names]
                 read = read._replace(names=self.names, curves=tuple(read.curves[i] for i in order))
             verdict = assess(result_of_trajectories(read, mission=mission))

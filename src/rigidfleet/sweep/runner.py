@@ -122,14 +122,9 @@ def fly(
                     with pools.start_processes(count) as executor:
                         flight.fly_by_executor(executor, lambda: count)
                 except RigidfleetError as error:
-                    if not isinstance(error.__cause__, BrokenExecutor):
-                        raise
                     deaths = 1 if flight.flown > before else deaths + 1
-                    if deaths >= _DEATHS:
-                        raise RigidfleetError(
-                            "the workers keep dying. Finished runs are saved. If memory is short, use fewer --workers;"
-                            " in a script, check for a missing `if __name__ == '__main__':`."
-                        ) from error
+                    if deaths >= _DEATHS or not isinstance(error.__cause__, BrokenExecutor):
+                        raise
         _log.info(f"{flight.words()}; done")
     return read(folder)
 

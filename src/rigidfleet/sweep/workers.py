@@ -136,5 +136,5 @@ def why_failed(error: Exception) -> str:
     if isinstance(error, CancelledError | OSError):
         return "the scheduler of the cluster ended, or the connection to it."
     if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # Dask's
-        return "workers died in the middle of runs. If memory is short, use fewer of them."
+        return "workers died. If memory is short, use fewer of them; a script needs `if __name__ == '__main__':`."
     return f"a worker failed: {type(error).__name__}: {error}."

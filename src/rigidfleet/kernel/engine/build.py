@@ -38,15 +38,13 @@ from rigidfleet.solids.records import Solids
 
 #: Functions that every evaluation calls, to be inlined; calls would take a tenth of a small formation's time.
 _HOT = (
-    "closed_loop", "input_law", "constraint_force", "accelerate", "mean_axes", "centre_of_mass", "inertia",
+    "closed_loop", "input_law", "constraint_force", "mean_axes", "centre_of_mass", "inertia",
     "inertia_inverse", "multiply", "damp_deformation", "reference_motion", "desired_agents", "local_law", "septic",
     "blend_slots", "distance_references", "right_side", "solve_multipliers", "assemble", "cholesky",
     "cholesky_solve", "apply_multipliers",
 )  # fmt: skip
 #: The same of sampled flights.
-_HOT_SAMPLED = (
-    "derivative", "attitude_matrix", "quaternion_rate", "contact", "normalise", "thrust_of", "speed_of",
-)  # fmt: skip
+_HOT_SAMPLED = ("attitude_matrix", "quaternion_rate", "thrust_of", "speed_of")
 #: Extents of the triangle, the paper's first formation, for which the integrator is compiled once more: loops of known
 #: length save a fifth of the time.
 THREE = {"N": 3, "m": 3, "P": 3, "A": 3}

@@ -288,7 +288,7 @@ def _compile_flight_constants(code: Code, name: str) -> Callable[[int, int], Non
         _compute_before_flight,
         f"before_{name}",
         arguments=2,
-        _flight_constants=flight_constants_intrinsic,
+        _write_flight_constants=flight_constants_intrinsic,
     )
     return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address)
 

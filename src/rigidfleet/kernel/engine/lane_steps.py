@@ -220,7 +220,7 @@ def record_trail_forces(p, state, array, row):
 
 @jit
 def record_step(t, h, p, w, state):
-    """As `dopri5.keep_step`, for each flight into its own trail.
+    """As `dopri5.record_step`, for each flight into its own trail.
 
     The halves of the step are kept as two.
     """
@@ -278,7 +278,7 @@ def write_step_samples(t, h, t_new, times, samples, p, state):
         count[SAMPLES] += 1
 
 
-#: What differs from `dopri5.integrate`, beside the right-hand side and `keep_step`, which calls it.
+#: What differs from `dopri5.integrate`, beside the right-hand side and `record_step`, which calls it.
 INSTEAD = {
     "_A": A,
     "_C": C,
