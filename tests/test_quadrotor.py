@@ -54,26 +54,6 @@ def relative(ours, theirs) -> float:
     return float((np.abs(ours - theirs) / np.maximum(1.0, np.abs(theirs))).max())
 
 
-def test_vehicles_of_a_vector_do_not_change_each_other():
-    """Each of nine vehicles, of which a vector holds eight, moves to the bit as alone: also a point, and one lost."""
-    kinds = [HUMMINGBIRD, *ROTORPY.values(), PAPER, *ROTORPY.values()]
-    kinds = [*kinds, fleet.VehicleDynamics(2.0, drag=(0.1, 0.2, 0.3), point=True)]
-    together = fleet.quadrotor_arrays(kinds, G)._replace(lost=np.arange(9) == 4)
-    S, command, wind = random_states(PAPER, 9, 7)
-
-    def motion(some: slice) -> np.ndarray:
-        vehicles = together._make(
-            x[some].copy() if isinstance(x, np.ndarray) else x for x in together
-        )
-        flight = fleet.ideal_flight(vehicles, start=0.0, h=1e-3, steps=1)
-        near = flight.air._replace(ground_effect=True, ground=S[:, 2].min() - 0.1)
-        near.floor[:] = S[some, 2] + 0.1  # below which the lost one is
-        return derivatives(flight._replace(air=near), S[some].copy(), command[some], wind[some])
-
-    alone = np.concatenate([motion(slice(i, i + 1)) for i in range(9)])
-    np.testing.assert_array_equal(motion(slice(9)), alone)
-
-
 # -- others' equations of motion -------------------------------------------------------------------
 
 

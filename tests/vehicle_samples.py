@@ -47,17 +47,13 @@ def derivatives(
     """Derivatives (N, 17) of states by the equations of motion; commands (N, 4), in still air or one that moves."""
     from rigidfleet.kernel import quadrotor  # which loads the compiler
 
-    n = len(S)
-    work = fleet.initial_state(flight, S, workspace(n, 0)).work
-    if air is not None:
-        work.air[0] = air
-    trial, rate = (x.reshape(-1, fleet.STATES, fleet.LANES).swapaxes(1, 2) for x in work.y[1:3])
-    for k in range(n):
-        trial[k // fleet.LANES, k % fleet.LANES] = S[k]
-    quadrotor.take_parameters(flight.vehicles, work)
-    quadrotor.take_inputs(command, np.zeros((n, 3)), work)
-    quadrotor.fleet_derivative(0, flight.vehicles, flight.air, work)
-    return rate.reshape(-1, fleet.STATES)[:n].copy()
+    out, none = np.empty_like(S), np.zeros(3)
+    for i in range(len(S)):
+        wind = none if air is None else air[i]
+        quadrotor.quadrotor_derivative(
+            S[i], command[i], i, flight.vehicles, flight.air, wind, none, np.eye(3), out[i]
+        )
+    return out
 
 
 def lag(tau: float) -> tuple[float, ...]:

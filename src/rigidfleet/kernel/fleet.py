@@ -32,8 +32,6 @@ STEPS, TICKS, LAWS, SAMPLES, TRAILED, ANSWERED = range(6)
 #: Columns of `SampledState.worst`: least cosine of the tilt; greatest tracking error [m], acceleration [m/s^2], thrust
 #: [N], constraint force [N], horizontal and vertical acceleration [m/s^2].
 UPRIGHT, ERROR, ACCELERATION, LOAD, CONSTRAINT_FORCE, HORIZONTAL, VERTICAL = range(7)
-#: Vehicles in a vector, and how many parameters and inputs each has there (`kernel.quadrotor`).
-LANES, PARAMETERS, INPUTS = padded(1), 40, 17
 #: A tick that no flight reaches (`TickInputs.last`).
 ENDLESS = 1 << 62
 
@@ -272,11 +270,7 @@ class SampledState(NamedTuple):
 class SampledWork(NamedTuple):
     """Work arrays of a sampled flight."""
 
-    # of G vectors of eight vehicles: number 0 of each vehicle, number 1, ...
-    y: Floats  # (7, G, 8 * 17) start, trial, four derivatives, end
-    parameters: Floats  # (G, 8 * 40)
-    inputs: Floats  # (G, 8 * 17)
-    axes: Floats  # (3, 8 * 3)
+    y: Floats  # (7, 17 N padded to eights) start, trial, four derivatives, end
     air: Floats  # (3, N, 3) velocity of the air: start, middle and end of a step [m/s]
     T: Floats  # (3, 3)
     desired: Floats  # (5, 3) desired attitude (3, 3), its rates and accelerations
@@ -483,12 +477,10 @@ def _initial_frame(q: Floats | None) -> Floats:
 
 
 def _new_work_arrays(n: int, m: int) -> SampledWork:
-    size, groups = 6 * n + m + 4, padded(n) // LANES
-    y = zeros(7, groups, LANES * STATES)
-    y[..., 6 * LANES : 7 * LANES] = 1.0  # attitudes also where a vector has no vehicle
+    size = 6 * n + m + 4
     return SampledWork(
-        y, np.ones((groups, LANES * PARAMETERS)), np.ones((groups, LANES * INPUTS)), zeros(3, LANES * 3),
-        zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1), np.zeros((1, size)), np.zeros(size),
+        zeros(7, padded(n * STATES)), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
+        np.zeros((1, size)), np.zeros(size),
     )  # fmt: skip
 
 

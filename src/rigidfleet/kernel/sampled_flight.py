@@ -28,7 +28,6 @@ from rigidfleet.kernel.fleet import (
     ERROR,
     FORCE,
     HORIZONTAL,
-    LANES,
     LAW_TIME,
     LAWS,
     LOAD,
@@ -52,7 +51,7 @@ from rigidfleet.kernel.neighbours import (
 )
 from rigidfleet.kernel.network import receive, send
 from rigidfleet.kernel.problem import SHAPE, TRACKING
-from rigidfleet.kernel.quadrotor import normalise_quaternion, runge_kutta, take_parameters
+from rigidfleet.kernel.quadrotor import normalise_quaternion, runge_kutta
 from rigidfleet.kernel.records import ASKS, COLLAPSED, FINISHED, PAUSED
 from rigidfleet.kernel.references import blend_slots, distance_references
 from rigidfleet.kernel.rigid_body import (
@@ -395,9 +394,8 @@ def advance_states(S, h, flight, state):
     """Advance all vehicles by h [s] in ``work.y``, from states S (N, 17) to row 6."""
     work = state.work
     for i in range(S.shape[0]):
-        own = work.y[0, i // LANES, i % LANES :: LANES]
         for q in range(17):
-            own[q] = S[i, q]
+            work.y[0, 17 * i + q] = S[i, q]
     runge_kutta(h, state.command, flight.vehicles, flight.air, state.push, work)
 
 
@@ -427,9 +425,8 @@ def write_derivatives(c, t, p, flight, state, call):
     find_air_velocity(t, 0.0, call.S[c], p, flight, state)
     advance_states(call.S[c], 0.0, flight, state)
     for i in range(state.S.shape[0]):
-        rate = state.work.y[2, i // LANES, i % LANES :: LANES]
         for q in range(17):
-            call.dS[c, i, q] = rate[q]
+            call.dS[c, i, q] = state.work.y[2, 17 * i + q]
 
 
 @jit
@@ -445,9 +442,8 @@ def write_samples(t, h, p, flight, state, call):
         find_air_velocity(t, x, state.S, p, flight, state)
         advance_states(state.S, x, flight, state)
         for i in range(state.S.shape[0]):
-            end = work.y[6, i // LANES, i % LANES :: LANES]
             for q in range(17):
-                call.S[c, i, q] = end[q]
+                call.S[c, i, q] = work.y[6, 17 * i + q]
             for q in range(4):
                 call.command[c, i, q] = state.command[i, q]
             for q in range(3):
@@ -478,8 +474,8 @@ def write_samples(t, h, p, flight, state, call):
 @jit
 def keep_step_path(i, h, work, points):
     """Bernstein coefficients (5, 6 N) of vehicle i over a step: of the quartic through r0, v0, a0, r1, v1; its rate."""
-    own = work.y[:, i // LANES, i % LANES :: LANES]
-    first, end, rate = own[0], own[6], own[2]
+    own = slice(17 * i, 17 * i + 17)
+    first, end, rate = work.y[0, own], work.y[6, own], work.y[2, own]
     n = points.shape[1] // 6
     for q in range(3):
         r0, v0, a0, r1, v1 = first[q], first[3 + q], rate[3 + q], end[q], end[3 + q]
@@ -501,8 +497,8 @@ def take_extremes(i, t, h, vehicles, state):
     A rotor's speed is monotone while its command is held, so the ends of steps have its greatest thrust. The
     acceleration of a point jumps at ticks, and is the highest after them.
     """
-    own = state.work.y[:, i // LANES, i % LANES :: LANES]
-    rate, end = own[2], own[6]
+    own = slice(17 * i, 17 * i + 17)
+    rate, end = state.work.y[2, own], state.work.y[6, own]
     across = rate[3] ** 2 + rate[4] ** 2
     record_if_worse(i, ACCELERATION, math.sqrt(across + rate[5] ** 2), t, state)
     record_if_worse(i, HORIZONTAL, math.sqrt(across), t, state)
@@ -543,9 +539,8 @@ def advance_fleet(t, h, p, flight, state):
             take_extremes(i, t, h, flight.vehicles, state)
         if kept:
             keep_step_path(i, h, state.work, trail.points[row])
-        end = state.work.y[6, i // LANES, i % LANES :: LANES]
         for q in range(17):
-            state.S[i, q] = end[q]
+            state.S[i, q] = state.work.y[6, 17 * i + q]
     return True
 
 
@@ -570,7 +565,6 @@ def fly_ticks(p, w, flight, state, call):
     ``state.f_u``, and tick + 1 into ``state.count``.
     """
     count, clock = state.count, state.clock
-    take_parameters(flight.vehicles, state.work)
     if call.max_steps == 0 and count[TICKS] == count[STEPS] // flight.steps:
         measure_for_laws(count[TICKS], clock[TIME], p, w, flight, state)
     room = state.trail.clock.shape[0]

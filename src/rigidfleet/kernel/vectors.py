@@ -1,7 +1,7 @@
 """Arithmetic on eight numbers at once, in the machine's vector registers.
 
-A vector holds eight consecutive states of one flight, or the same state of eight flights or eight vehicles. ``+``,
-``-``, ``*``, ``/``, ``abs``, ``max`` and ``math.sqrt`` act on each of its numbers.
+A vector holds eight consecutive states of one flight, or the same state of eight flights. ``+``, ``-``, ``*``,
+``abs`` and ``max`` act on each of its numbers.
 
 - ``as_lanes(rows)``: float64 rows (k, n), n a multiple of 8, viewed as vectors (k, n / 8); rows of vectors unchanged;
 - ``fill_lanes(x)``: a vector of eight numbers x;

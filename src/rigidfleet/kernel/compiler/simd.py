@@ -150,7 +150,7 @@ def _register_lane_functions(functions: tuple[Any, ...], arity: int, generate: A
 
 
 def build_arithmetic(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, name: str) -> ir.Value:
-    """Build one of LLVM's instructions on vectors: fadd, fsub, fmul, fdiv."""
+    """Build one of LLVM's instructions on vectors: fadd, fsub, fmul."""
     return getattr(builder, name)(a, b, flags=_FAST)
 
 
@@ -243,7 +243,6 @@ BUILD: dict[str, Any] = {
     "add": partial(build_arithmetic, name="fadd"),
     "sub": partial(build_arithmetic, name="fsub"),
     "mul": partial(build_arithmetic, name="fmul"),
-    "div": partial(build_arithmetic, name="fdiv"),
     "neg": ir.IRBuilder.fneg,
     "inverse": build_inverse,
     "inverse_root": build_inverse_root,
@@ -258,12 +257,7 @@ BUILD: dict[str, Any] = {
 _register_lane_functions((operator.add, operator.iadd), 2, BUILD["add"])
 _register_lane_functions((operator.sub, operator.isub), 2, BUILD["sub"])
 _register_lane_functions((operator.mul, operator.imul), 2, BUILD["mul"])
-_register_lane_functions((operator.truediv,), 2, BUILD["div"])
-_register_lane_functions((operator.neg,), 1, BUILD["neg"])
 _register_lane_functions((abs,), 1, BUILD["abs"])
-_register_lane_functions(
-    (math.sqrt,), 1, lambda builder, x: builder.call(_llvm_intrinsic(builder, "sqrt", 1), [x])
-)
 _register_lane_functions((max,), 2, BUILD["max"])
 
 
