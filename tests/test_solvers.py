@@ -207,10 +207,10 @@ def test_factor_is_that_of_the_matrix(rng):
     found = ordering.symbolic_factorisation(64, edges, solvers.dissection_order(p, edges), 1e9)
     blocks, at = np.empty((len(found.row), 9)), np.empty(64, dtype=np.int64)
     u = directions(p, edges)
-    block_cholesky.assemble_K(
+    block_cholesky.assemble(
         u, edges, masses, 1.3, 0.1, found.place, found.column, found.of_edge, blocks
     )
-    assert block_cholesky.factor_blocks(
+    assert block_cholesky.factor(
         found.column, found.row, found.first, found.left, found.block, blocks, at
     )
     L = np.zeros((64, 3, 64, 3))

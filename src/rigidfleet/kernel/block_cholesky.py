@@ -64,7 +64,7 @@ def fill_blocks(first, left, parent, mark, free, out):
 
 
 @jit
-def assemble_K(u, edges, m, mbar, mu, place, column, of_edge, L):
+def assemble(u, edges, m, mbar, mu, place, column, of_edge, L):
     """K = mbar J^T J + mu M into the blocks L (B, 9)."""
     for q in range(L.shape[0]):
         for s in range(9):
@@ -84,7 +84,7 @@ def assemble_K(u, edges, m, mbar, mu, place, column, of_edge, L):
 
 
 @jit
-def factor_blocks(column, row, first, left, block, L, at):
+def factor(column, row, first, left, block, L, at):
     """Factor by blocks in place, column by column; return False if the matrix is not positive definite.
 
     The diagonal blocks store the inverses of their pivots. Updates outside the pattern
@@ -216,7 +216,7 @@ def multiply_by_K(u, edges, m, mbar, mu, a, out):
 
 
 @jit_inline
-def inner_product(a, b):
+def inner(a, b):
     """Sum of a b over (N, 3) arrays."""
     s = 0.0
     for i in range(a.shape[0]):
@@ -290,18 +290,18 @@ def conjugate_gradients(u, edges, m, mbar, mu, R, place, column, row, L, g, x, w
         for s in range(3):
             r[i, s] = g[i, s] - Kq[i, s]
             q[i, s] = 0.0
-    last, rest = 1.0, inner_product(r, r)
+    last, rest = 1.0, inner(r, r)
     for iteration in range(most + 1):
         if rest <= within * within:
             return iteration
         precondition(R, place, column, row, L, r, w, z)
-        rz = inner_product(r, z)
+        rz = inner(r, z)
         for i in range(n):
             for s in range(3):
                 q[i, s] = z[i, s] + (rz / last) * q[i, s]
         last = rz
         multiply_by_K(u, edges, m, mbar, mu, q, Kq)
-        step = rz / inner_product(q, Kq)
+        step = rz / inner(q, Kq)
         rest = 0.0
         for i in range(n):
             for s in range(3):

@@ -14,7 +14,7 @@ from rigidfleet.kernel.rigid_body import centre_of_mass, inertia, inertia_invers
 
 
 @jit
-def solve_exact_law(u, b, r, m, M, order, known, cm, I, I_inv, a, f_C):
+def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, f_C):
     """Compute f_C (N, 3) of the exact law for b (m,) and return the smallest pivot; if lost, write nothing.
 
     The agents are at r (N, 3), with unit vectors u (m, 3). The centre of mass cm, the inertia I about it and its
@@ -101,7 +101,7 @@ def balanced_forces(r, m, M, cm, I_inv, a, f):
 
 
 @jit
-def multipliers_of_forces(u, order, f, multiplier):
+def multipliers(u, order, f, multiplier):
     """Multipliers (m,) with J^T lambda = f for balanced forces f (N, 3), last agent first; f is overwritten.
 
     Each agent's three edges carry its force, and pass the reactions to the agents before.
