@@ -37,7 +37,7 @@ class Steps:
                 self.rows.append((t, h, state.trail.points[row].copy()))
             take(extremes, problem, work, state, last=last)
 
-        monkeypatch.setattr(watching.Extremes, "take_steps", spy)
+        monkeypatch.setattr(watching.Extremes, "monitor_steps", spy)
 
     def positions(self, n: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
         """Times (K,) and positions (K, N, 3) of agents in all steps; of the inertial formulation."""
@@ -435,7 +435,7 @@ def test_to_watch_a_large_formation_does_not_change_its_flight(form, monkeypatch
     def pass_over(extremes: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
         state.count[TRAILED] = 0
 
-    monkeypatch.setattr(watching.Extremes, "take_steps", pass_over)
+    monkeypatch.setattr(watching.Extremes, "monitor_steps", pass_over)
     alone = simulate(mission)
     assert not alone.phases[0].extremes
     assert (watched.position == alone.position).all()
@@ -471,12 +471,12 @@ def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, mon
                 flight.deepest_contact()
         return flight.finish()
 
-    monkeypatch.setattr(watching.Extremes, "take_steps", spy)
+    monkeypatch.setattr(watching.Extremes, "monitor_steps", spy)
     aside, looked = simulate(mission), flown()
     assert len(threads) > 1, "each phase's last steps are taken here"
 
     def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> None:
-        extremes.take_steps(problem, work, state, last=False)
+        extremes.monitor_steps(problem, work, state, last=False)
 
     monkeypatch.setattr(watching.Extremes, "hand_over", take_here)
     for one, other in ((aside, simulate(mission)), (looked, flown())):
@@ -502,9 +502,9 @@ def test_no_step_is_overwritten_before_it_has_been_watched(monkeypatch):
         take(*given, **options)
 
     def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> None:
-        extremes.take_steps(problem, work, state, last=False)
+        extremes.monitor_steps(problem, work, state, last=False)
 
-    monkeypatch.setattr(watching.Extremes, "take_steps", take_slowly)
+    monkeypatch.setattr(watching.Extremes, "monitor_steps", take_slowly)
     aside = flown()
     monkeypatch.setattr(watching.Extremes, "hand_over", take_here)
     assert aside == flown()
@@ -521,7 +521,7 @@ def test_what_goes_wrong_in_the_thread_that_watches_is_raised(monkeypatch):
         take(*given, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(watching.Extremes, "take_steps", fail)
+        patch.setattr(watching.Extremes, "monitor_steps", fail)
         with pytest.raises(MemoryError, match="no more of it"):
             simulate(mission)
     done, wait = [], watching.Extremes.wait_for_steps

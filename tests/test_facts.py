@@ -351,7 +351,7 @@ def test_the_report_of_a_show_has_nothing_of_edges():
     words = Page(report_page(result)).text
     assert not re.search(r"\(0 edges|no edges|overshoot|constraint f|tension|\|c\|", words), words
     checks = page["flights"][0]["checks"][-1]
-    assert all(row[1] or row[3] for row in checks.texts)
+    assert all(row[1] or row[3] for row in checks.cell_texts)
     assert "no edges" not in printed(rf.assess(result))
 
 

@@ -286,7 +286,7 @@ def test_each_flight_side_by_side_has_its_own_trail(monkeypatch):
             ends.setdefault(id(self), []).append(here)
         take(self, problem, work, state, last=last)
 
-    monkeypatch.setattr(Extremes, "take_steps", kept)
+    monkeypatch.setattr(Extremes, "monitor_steps", kept)
     simulate_together(missions)
     monkeypatch.undo()
     assert len(ends) == 8
