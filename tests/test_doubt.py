@@ -408,7 +408,7 @@ def test_vehicles_in_another_order_are_told(plan: rf.Result) -> None:
     log = flown(plan, np.random.default_rng(17))
     turned = log._replace(names=("b", "c", "a"), curves=(*log.curves[1:], log.curves[0]))
     notes = [judge_log(each, plan, Doubts(SIGMA, 0.0))[1].notes for each in (log, turned)]
-    said = "b, c, a count as agents from 1 on, but are where agents 2, 3, 1 are to be"
+    said = "b counts as agent 1, but is where agent 2 is to be, c counts as agent 2, but is where agent 3"
     assert [any(said in note for note in each) for each in notes] == [False, True]
 
 

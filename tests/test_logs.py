@@ -761,7 +761,21 @@ def test_robots_in_frames_of_their_own_are_not_compared(tmp_path):
         read_trajectories(path)
     read = read_trajectories(path, topic="/tf:cf?/base")
     assert read.names == ("/tf:cf1/base", "/tf:cf2/base")
+    assert said(read, "positions are in frames enu cf1/odom, enu cf2/odom")
     np.testing.assert_allclose(at_samples(read, 1)[1][:, 0], 0.1 * np.arange(50))
+
+
+def test_frames_that_move_in_each_other_are_refused(tmp_path):
+    path = transforms_bag(tmp_path / "bag", lambda k: [("a", "b", 0.1 * k), ("b", "a", -0.1 * k)])
+    with pytest.raises(TrajectoryError, match="in frames enu a, enu b"):
+        read_trajectories(path)
+
+
+def test_odometry_of_one_robot_is_no_robot(tmp_path):
+    path = transforms_bag(
+        tmp_path / "bag", lambda k: [("map", "cf1_odom", 1.0), ("cf1_odom", "cf1", 0.1 * k)]
+    )
+    assert read_trajectories(path).names == ("/tf:cf1",)
 
 
 def test_a_body_in_two_frames_is_in_the_first(tmp_path):
@@ -777,12 +791,18 @@ def test_a_body_in_two_frames_is_in_the_first(tmp_path):
 def test_where_vehicles_are_to_be_is_no_vehicle(tmp_path):
     """Setpoints and goals are not judged as vehicles beside those that fly to them, unless they are named."""
     at = [(1_700_000_000 * 10**9 + 20_000_000 * k, 0.01 * k) for k in range(50)]
-    topics = {"/cf1/pose": 0.0, "/cf1/setpoint": 0.2, "/goal_pose": 0.3, "/targets/cf2": 3.0}
+    topics = {
+        "/cf1/pose": 0.0,
+        "/cf1/setpoint": 0.2,
+        "/goal_pose": 0.3,
+        "/targets/cf2": 3.0,
+        "/cf1/goalPose": 0.4,
+    }
     rows = [(topic, t, t, [x + by, 0.0, 1.0]) for t, x in at for topic, by in topics.items()]
     path = poses_bag(tmp_path / "bag", rows)
     read = read_trajectories(path)
     assert read.names == ("/cf1/pose", "/targets/cf2")
-    assert said(read, "topics that are not read: /cf1/setpoint, /goal_pose")
+    assert said(read, "topics that are not read: /cf1/goalPose, /cf1/setpoint, /goal_pose")
     assert read_trajectories(path, topic="/goal_pose").names == ("/goal_pose",)
 
 

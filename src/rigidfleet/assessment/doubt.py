@@ -93,7 +93,7 @@ class DrawnWays:
                 return by if by > 0.5 * least else 0.0
             return math.degrees(math.atan2(by, least)) if check.unit == "deg" else by
         sizes = _norms(shifts[:, order])
-        most = float(sizes.max(initial=0.0))
+        most = _greatest(sizes)
         if q.name in ("separation", "separation_flying"):
             k, i, j = self._near_pairs(float(check.worst or 0.0) + 4.0 * most)
             return _greatest_norm(shifts[:, 0, k, i] - shifts[:, 0, k, j])
@@ -293,9 +293,13 @@ def doubt_notes(facts: dict[str, Any]) -> Iterator[str]:
         causes = f"against the plan the log is {' and '.join(parts)}"
         yield f"{causes}. {judged}; without clock and set-up, {left} are left"
     if order := facts.get("order"):
-        names = first_few([each["name"] for each in facts["vehicles"]])
-        where = f"where agents {first_few(order)} are to be: the log may have another order"
-        yield f"{names} count as agents from 1 on, but are {where}"
+        places = enumerate(zip(facts["vehicles"], order, strict=True), 1)
+        moved = [
+            f"{each['name']} counts as agent {k}, but is where agent {i} is to be"
+            for k, (each, i) in places
+            if i != k
+        ]
+        yield f"{first_few(moved)}: the log may have another order"
     for each in facts["vehicles"]:
         if each["off_its_slot"]:
             off, by = 1e3 * each["mean_off_m"], 1e3 * np.nan_to_num(each["mean_error_m"])

@@ -443,7 +443,8 @@ def _doubts_about_units(table: TextTable, tracks: list[Track], *, axes: bool) ->
     steps = np.concatenate([np.diff(track.time) for track in tracks])
     fastest = float((np.concatenate(ways) / np.where(steps > 0.0, steps, np.inf)).max(initial=0.0))
     moves = max(map(np.sum, ways)) > _SLOW and float(np.median(steps)) >= _LONG
-    if fastest > _FAST or (moves and fastest < _SLOW and not table.units["time"][1]):
+    unsaid = not all(table.units[q][1] for q in ("time", "length"))
+    if (unsaid and fastest > _FAST) or (moves and fastest < _SLOW and not table.units["time"][1]):
         remedy = "Name columns such as time_ms and x_mm, or say --units ms or s, mm or m"
         note = f"{note}, so that speeds reach {fastest:.3g} m/s"
         if fastest > _FAST:

@@ -236,9 +236,11 @@ def trajectories_of(
     samples = [(seconds(x.time), x.place, x.yaw) for x in every]
     curves = [curve_through_samples(*own, interpolation, str) for own in samples]
     frames = {track.frame if track.origin is None else "geodetic" for track in every}
-    if len(frames) > 1 and not topics:
+    if len(frames) > 1:
         words = f"positions are in frames {first_few(sorted(frames))}: where one is in another is not known"
-        raise fault(words, "Name topics of one frame: --topic")
+        if not topics:
+            raise fault(words, "Name topics of one frame: --topic")
+        notes[words] = [""]
     if not topics and all(who == track.topic for who, track in tracks.items()):
         _refuse_duplicates([*tracks], curves)
     record: dict[str, Any] = {

@@ -36,7 +36,9 @@ MCAP, SQLITE, ZSTANDARD = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f
 _BILLION = 1_000_000_000
 #: Frames of REP 105 in which robots move, perhaps each in its own; that of odometry moves in the map itself. And words
 #: for places that a robot is to reach.
-_NO_VEHICLE = re.compile(rf":(.*/)?(map|odom)$|(?<![a-z])({'|'.join(sorted(WANTED))})(?![a-z])")
+_NO_VEHICLE = re.compile(rf":(.*[/_])?(map|odom)$|(?<![a-z])({'|'.join(sorted(WANTED))})(?![a-z])")
+#: Before a capital within a word.
+_CAPITAL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 #: Greatest size of a chunk of a recording when it is unpacked, and of a message [bytes].
 _CHUNK, _MESSAGE = 32 << 20, 1 << 20
 #: What no position [m] or quaternion reaches.
@@ -89,6 +91,8 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         for each in chain.from_iterable(_read_positions(path, unread) for path in paths):
             topic, first, stamp, received, numbers = each
             own = rows.setdefault(topic, _Rows(*first, array("q"), array("q"), array("d")))
+            if first[2] and not own.frame:
+                own = rows[topic] = _Rows(*first, array("q"), array("q"), array("d"))
             if own.frame != first[2]:
                 unread[f"{topic} in {first[2]!r}"] = f"is in {own.frame!r} first"
                 continue
@@ -114,11 +118,12 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         unread |= {c.topic: "has no stamps, as others have" for c in undated}
         chosen = [c for c in chosen if c not in undated]
     if not topics:
-        chosen = [c for c in chosen if c.message == chosen[0].message]
         # What moves in a body is a part of it; what a robot moves in, or is to reach, is no robot.
-        moving = [c for c in chosen if not _NO_VEHICLE.search(c.topic.lower())]
-        bodies = {c.topic.partition(":")[2] for c in moving if c.message == "TFMessage"}
-        chosen = [c for c in moving or chosen if c.frame not in bodies]
+        names = {c.topic: _CAPITAL.sub("_", c.topic).lower() for c in chosen}
+        moving = [c for c in chosen if not _NO_VEHICLE.search(names[c.topic])] or chosen
+        chosen = [c for c in moving if c.message == moving[0].message]
+        bodies = {c.topic.partition(":")[2] for c in chosen if c.message == "TFMessage"}
+        chosen = [c for c in chosen if c.frame not in bodies] or chosen
         if others := sorted({c.topic for c in channels} - {c.topic for c in chosen})[:5]:
             notes.append(f"topics that are not read: {', '.join(others)}; --topic may name them")
     clock = "that of the stamps in messages"
@@ -145,7 +150,7 @@ def _read_positions(path: Path, unread: dict[str, str]) -> Iterator[_Place]:
         package, kind = name.partition("/")[0], name.rpartition("/")[2]
         own = package == "px4_msgs"
         if own:
-            kind = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind).lower()  # as PX4's logs name it
+            kind = _CAPITAL.sub("_", kind).lower()  # as PX4's logs name it
         if name == "nav_msgs/msg/Path":
             unread[topic] = _PATH
         elif own and kind in FORMS and not definition:

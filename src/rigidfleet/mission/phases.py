@@ -369,7 +369,9 @@ def _follow_rules(m: Draft, p: Follow, k: int, longest: float | None) -> Breache
     if p.travel and p.settle is None and longest is not None and longest > p.travel * (1 + 1e-9):
         # Beyond the file the body goes on as it ends, and the vehicles rest beside each other.
         v = way.states(way.time[-1:], 2)[1, 0, :, :3] * (way.time[-1] / p.travel)
-        speed = np.linalg.norm(v - v.mean(axis=0), axis=1)
+        mass = () if m.agents is None else m.agents.mass
+        body = np.average(v, axis=0, weights=mass if len(mass) == len(v) else None)
+        speed = np.linalg.norm(v - body, axis=1)
         if (most := speed.max()) > _JUMPS[1][0]:
             who = f"agent {speed.argmax() + 1} goes on at {most:.2f} m/s beside the others"
             remedy = "let the trajectories end at rest, or the phase with them"
