@@ -348,3 +348,18 @@ def test_avoidance_needs_vehicles():
     data = rf.load_mission("square").to_dict() | {"avoidance": {}}
     with pytest.raises(MissionError, match="sampled control"):
         rf.Mission.from_dict(data)
+
+
+def test_ways_that_begin_elsewhere_are_refused_beside_avoidance():
+    """Avoidance leads the body beside its plan, but never the slots about it."""
+    data = rf.load_mission("moving-obstacles").to_dict()
+    slots = rf.Mission.from_dict(data).formation_slots("cube")
+    data["formations"]["big"] = {"shape": "cube", "size": 6.0}
+    points = [slots[::-1].tolist()] * 4 + [(1.5 * slots).tolist()] * 4
+    data["phases"] = data["phases"][:1] + [
+        {"kind": "reshape", "formation": "big", "blend": 6.0, "duration": 7.0, "control_points": points,
+         "alignment": "none", "control": "tracking"}
+    ]  # fmt: skip
+    data["obstacles"] = [data["obstacles"][0] | {"centre": [100.0, 100.0, 9.5]}]
+    with pytest.raises(rf.MissionError, match="begins in other slots"):
+        rf.simulate(rf.Mission.from_dict(data))

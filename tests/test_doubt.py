@@ -455,7 +455,7 @@ def test_what_would_decide_a_shape_decides() -> None:
 
     def check(sigma: float, seed: int) -> Any:
         t = np.arange(0.0, 15.0 + 1e-9, 0.05)
-        way = ways_of(plan.motion(flown=True), slice(None)).at(t)[..., :3]
+        way = ways_of(plan.setpoints_at_samples(flown=True), slice(None)).at(t)[..., :3]
         x = way + sigma * np.random.default_rng(seed).standard_normal(way.shape)
         log = logged([t] * plan.n_agents, list(x.swapaxes(0, 1)))
         return judge_log(log, plan, Doubts(sigma, 0.0))[1].by_name["shape"]
@@ -558,3 +558,14 @@ def test_the_flights_of_the_page_are_judged(benchmark_named: Any, kind: str, cou
     assert {row["clean flights failed"] for row in rows if row["clean flights failed"] >= 0} == {0}
     assert {row["collisions passed"] for row in rows if row["collisions passed"] >= 0} == {0}
     assert evening.rows_of(kind, rows).endswith("| 0 | 0 | yes |")
+
+
+def test_too_few_samples_are_an_error(plan: rf.Result) -> None:
+    log = flown(plan, np.random.default_rng(19))
+    ends = [
+        curve_through_samples(c.time[:2], c.at(c.time[:2])[:, :3], None, "cubic", str)
+        for c in log.curves
+    ]
+    few = log._replace(curves=tuple(ends))
+    with pytest.raises(rf.TrajectoryError, match="too few samples"):
+        judge_log(few, plan, Doubts(SIGMA, 0.0))

@@ -91,7 +91,7 @@ def draw_ground(result: Result, falls: Floats) -> Figure:
     drawn = drawn_areas(result.mission)
     for look in {str(look): look for *_, look in drawn}.values():
         names = ", ".join(name for name, _, other in drawn if other == look)
-        handles.append(Patch(label=st.clean_name(names), **look))
+        handles.append(Patch(label=st.clean_name(names, 80), **look))
     ax.set(xlabel="x, east [m]", ylabel="y, north [m]")
     ax.margins(0.06)
     ax.set_aspect("equal", adjustable="box")

@@ -38,6 +38,10 @@ _KNOTS, _MOST, _LEAST = 8_000_000, 40, 12
 _TOUCH = 4.0
 #: Times for which a result keeps how far places are in doubt.
 _BANDS = 500
+#: Samples of a vehicle from which a way can be smoothed, at least.
+_SAMPLES = 4
+#: Usual steps by which a log ends before a plan does and is complete, at most: a log of bursts has rare steps.
+_STEPS = 3.0
 #: Share by which the noise that samples show is more than the one stated.
 _MORE = 1.5
 #: Correlation times of noise of which no more is known than its size [s].
@@ -98,6 +102,9 @@ def _likely_flight(
 ) -> tuple[Result, Any, NoiseEstimate, Alignment | None]:
     """The likely flight of a log, how ways drawn differ from it, and what is known of noise, clock and set-up."""
     logs = [Positions(c.time, c.at(c.time)[:, :3], np.ones(len(c.time))) for c in read.curves]
+    if min(len(log.time) for log in logs) < _SAMPLES:
+        words = f"has too few samples to be judged with doubt. Give at least {_SAMPLES} of each vehicle."
+        raise TrajectoryError(f"{read.names[0]}: {words}")
     sizes = [x.deviation for x in read.measured if x.deviation is not None]
     known = len(sizes) == len(logs) and all((x > 0.0).all() for x in sizes)
     if doubts.noise == "log" and not known:
@@ -126,12 +133,16 @@ def _likely_flight(
     # Beside a plan, a sample counts a step beyond it, as others are lost, and by part of which clocks may be off.
     ends = np.array([log.time[[0, -1]] for log in logs])
     if plan is not None:
-        ends += np.array([[-1.0, 1.0]]) * [[np.quantile(np.diff(log.time), 0.95)] for log in logs]
+        steps = [np.diff(log.time) for log in logs]
+        beyond = [min(np.quantile(x, 0.95), _STEPS * np.median(x)) for x in steps]
+        ends += np.outer(beyond, [-1.0, 1.0])
     each = zip(smoothed, ends.tolist(), strict=True)
     whole = join_curves([own.way.between(*end) for own, end in each])
+    if not read.away:
+        ends[:] = whole.time[[0, -1]]
     if plan is not None:
         ends[:, 1] = np.minimum(ends[:, 1], plan.mission.lost_at)
-    spans = ends.tolist() if read.away and np.ptp(ends, axis=0).any() else []
+    spans = ends.tolist() if np.ptp(ends, axis=0).any() else []
     if plan is None or planned is None:
         blank = Piecewise(whole.time, np.full((*whole.pieces.shape[:2], 1, 1), np.nan))
         judged |= {"names": read.names, "spans": spans, "since": read.since}

@@ -386,7 +386,8 @@ class Flight:
             self._report_progress(phase, planning=True)
         try:
             where = self._state_now, len(self._phases_begun)
-            evades = not by_hand and layers(self.mission) is not None  # and may be beside the plan
+            # Avoidance leads the body beside its plan, from where a follow leads back; never the slots about it.
+            evades = phase.follows_curves and not by_hand and layers(self.mission) is not None
             leg = timed_leg(self.mission, phase, *where, anywhere=evades)
             plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
