@@ -354,6 +354,7 @@ def test_ways_that_begin_elsewhere_are_refused_beside_avoidance():
     """Avoidance leads the body beside its plan, but never the slots about it."""
     data = rf.load_mission("moving-obstacles").to_dict()
     slots = rf.Mission.from_dict(data).formation_slots("cube")
+    assert slots is not None
     data["formations"]["big"] = {"shape": "cube", "size": 6.0}
     points = [slots[::-1].tolist()] * 4 + [(1.5 * slots).tolist()] * 4
     data["phases"] = data["phases"][:1] + [

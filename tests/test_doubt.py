@@ -567,5 +567,5 @@ def test_too_few_samples_are_an_error(plan: rf.Result) -> None:
         for c in log.curves
     ]
     few = log._replace(curves=tuple(ends))
-    with pytest.raises(rf.TrajectoryError, match="too few samples"):
+    with pytest.raises(TrajectoryError, match="too few samples"):
         judge_log(few, plan, Doubts(SIGMA, 0.0))
