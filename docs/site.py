@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import ziamath
-from mkdocs.code_structure.files import File, Files
-from mkdocs.code_structure.pages import Page
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 from mkdocs.config.config_options import ExtraScriptValue
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
