@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import ziamath
-from mkdocs.structure.files import File, Files
-from mkdocs.structure.pages import Page
 from mkdocs.config.config_options import ExtraScriptValue
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "docs"))
