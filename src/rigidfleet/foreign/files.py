@@ -126,13 +126,12 @@ def read_trajectories(
     notes = [*logs.notes_with_names(whose)]
     if several and any(part.read[0].get("clock") == logs.GNSS for part in parts):
         notes.insert(0, f"the clock that vehicles have in common is {logs.GNSS}")
-    frames = sorted(
-        {x["frame"] for part in parts for x in part.read[:1] if "frame" in x and "origin" not in x}
-    )
-    if len(frames) > 1:
-        words = f"positions are in frames {first_few(frames)}: where one is in another is not known"
+    every = (part.read[0] for part in parts if part.read)
+    if words := logs.frames_in_words(
+        {x["frame"] for x in every if "frame" in x and "origin" not in x}
+    ):
         if not topics:
-            raise _error(sources[0], words, "Name topics of one frame: --topic")
+            raise _error(sources[0], words, logs.ONE_FRAME)
         notes.append(words)
     own_clocks = several and any(part.own_clocks for part in parts)
     if own_clocks:

@@ -14,7 +14,7 @@ import math
 import re
 from array import array
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, redirect_stderr, redirect_stdout
 from fnmatch import fnmatchcase
 from importlib.util import find_spec
@@ -195,6 +195,18 @@ def natural_sort_key(name: object) -> list[tuple[int, str]]:
     return [(int(x), "") if x.isdecimal() and len(x) < 19 else (-1, x) for x in parts]
 
 
+#: What to do if vehicles are in several frames.
+ONE_FRAME = "Name topics of one frame: --topic"
+
+
+def frames_in_words(frames: Collection[str]) -> str:
+    """That vehicles are in several frames; "" if all are in one."""
+    several = (
+        f"positions are in frames {first_few(sorted(frames))}: where one is in another is not known"
+    )
+    return several if len(frames) > 1 else ""
+
+
 def trajectories_of(
     log: Log, stem: str, interpolation: str, topics: Sequence[str], origin: Geodetic | None, several: bool
 ) -> Trajectories:  # fmt: skip
@@ -236,10 +248,9 @@ def trajectories_of(
     samples = [(seconds(x.time), x.place, x.yaw) for x in every]
     curves = [curve_through_samples(*own, interpolation, str) for own in samples]
     frames = {track.frame if track.origin is None else "geodetic" for track in every}
-    if len(frames) > 1:
-        words = f"positions are in frames {first_few(sorted(frames))}: where one is in another is not known"
+    if words := frames_in_words(frames):
         if not topics:
-            raise fault(words, "Name topics of one frame: --topic")
+            raise fault(words, ONE_FRAME)
         notes[words] = [""]
     if not topics and all(who == track.topic for who, track in tracks.items()):
         _refuse_duplicates([*tracks], curves)
