@@ -183,6 +183,8 @@ _ROUNDS = 20
 
 #: Greatest number of agents for which the least sum of squares of all orders is found.
 _LEAST = 1024
+#: Greatest number of agents for which nobody waits for it.
+_FEW = 100
 
 
 def _least_squares_assignment(p: Floats, q: Floats) -> Ints:
@@ -199,7 +201,15 @@ def _least_squares_assignment(p: Floats, q: Floats) -> Ints:
         return order_by_exchanges(p, q)
     from scipy.optimize import linear_sum_assignment
 
-    return linear_sum_assignment(-(p @ q.T))[1]
+    if n <= _FEW:
+        return linear_sum_assignment(-(p @ q.T))[1]
+    # Squares of distances between centred places, less the least of each slot and then of each agent, have the same
+    # best order, which is found in a fifth of the time. Of orders that are equally good, it may be another one.
+    p, q = p - p.mean(axis=0), q - q.mean(axis=0)
+    squares = 0.5 * (p**2).sum(axis=1, keepdims=True) - p @ q.T
+    squares -= squares.min(axis=0)
+    squares -= squares.min(axis=1, keepdims=True)
+    return linear_sum_assignment(squares)[1]
 
 
 #: Number of agents whose exchanges with all others are found together.
