@@ -1056,6 +1056,19 @@ def test_damaged_logs_are_one_error(log, tmp_path, capfd):
 # -- Crazyflie ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("name", "step"), [("cfclient", 1e-6), ("cfclient_compressed", 1e-3)])
+def test_tables_that_cfclient_wrote(log, name, step):
+    """Its writer was handed a circle with the yaw of its tangent, or whole millimetres of it, from 12.345 s on."""
+    read = read_trajectories(log(f"{name}.csv"))
+    time, place = at_samples(read)
+    t = 0.01 * np.arange(250)
+    np.testing.assert_allclose(time, 12.345 + t, atol=1e-9)
+    circle = [np.cos(0.8 * t), np.sin(0.8 * t), 1 + 0.3 * np.sin(0.5 * t)]
+    np.testing.assert_allclose(place, np.transpose(circle), atol=step)
+    if name == "cfclient":
+        np.testing.assert_allclose(read.curves[0].at(time)[:, 3], 0.8 * t, atol=1e-6)
+
+
 def test_logs_of_cfclient_are_in_milliseconds_and_degrees(tmp_path):
     """Columns that cfclient names after variables have their units: ms, m or mm, m/s, deg."""
     variables = (
