@@ -1,8 +1,10 @@
 """What the documents say is so: tables, code, commands, links, functions and tests they name."""
 
 import ast
+import builtins
 import importlib
 import importlib.util
+import itertools
 import re
 import tomllib
 from collections.abc import Iterator
@@ -74,6 +76,19 @@ def test_every_kind_of_phase_has_its_section():
     assert tables.kinds_without_section(missions.replace("of kind `brake`", "of brakes")) == {
         "brake"
     }
+
+
+def test_every_key_of_a_phase_has_a_row():
+    """Each key of a kind of phase stands in a table of a section that names the kind, or in that of every kind."""
+    from rigidfleet.mission.kinds import KINDS
+
+    sections = page("missions.md").split("\n### `[[phases]]`")[1:]
+    heads = [section.partition("\n")[0] for section in sections]
+    for kind, model in KINDS.items():
+        own = [f"`{kind}`" in head or "every kind" in head for head in heads]
+        text = "".join(itertools.compress(sections, own))
+        rows = set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE))
+        assert set(model.model_fields) - {"kind"} <= rows, kind
 
 
 @pytest.mark.long
@@ -405,6 +420,21 @@ def test_code_of_the_pages_can_be_imported(path):
                 missing = [x.name for x in line.names if not hasattr(module, x.name)]
                 # What is no name of the module is a module below it
                 assert all(importlib.util.find_spec(f"{line.module}.{x}") for x in missing)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_code_of_the_pages_has_all_its_names(path):
+    """What the Python of a page uses is made in it, or in a block above."""
+    known = set(dir(builtins))
+    for code in blocks(path.read_text(encoding="utf-8"), "python"):
+        nodes = list(ast.walk(ast.parse(code)))
+        names = [x for x in nodes if isinstance(x, ast.Name)]
+        known |= {x.id for x in names if isinstance(x.ctx, ast.Store)}
+        known |= {x.arg for x in nodes if isinstance(x, ast.arg)}
+        known |= {x.name for x in nodes if isinstance(x, ast.FunctionDef | ast.ClassDef)}
+        imported = [x for x in nodes if isinstance(x, ast.alias)]
+        known |= {x.asname or x.name.partition(".")[0] for x in imported}
+        assert {x.id for x in names if isinstance(x.ctx, ast.Load)} <= known, code
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)

@@ -213,7 +213,7 @@ class Agents(Part):
         "initial velocity of each agent [m/s]; default: at rest", ()
     )
     fixed: tuple[values.AgentNumber, ...] = key(
-        "numbers of agents that never move; only with control 'open', solver 'pinv'", ()
+        "agents that never move; only with control 'open', solver 'pinv' or 'spectral'", ()
     )
     radius: Annotated[tuple[values.LengthOrZero, ...], values.number_or_list(0)] = key(
         "radius of the sphere around an agent that must not touch anything [m]: a number or a list",
