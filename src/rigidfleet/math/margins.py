@@ -77,17 +77,6 @@ class Lag:
     rate: float = math.inf
     point: bool = False
 
-    def __post_init__(self) -> None:
-        positive = {"rate": self.rate}
-        if not self.point:
-            positive |= {"k_R": self.k_R, "k_omega": self.k_omega}
-        for name, value in positive.items():
-            if not value > 0:
-                raise ValueError(f"{name} of a vehicle must be positive, not {value}")
-        for name, value in {"tau": self.tau, "delay": self.delay}.items():
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} of a vehicle must be finite and >= 0 [s], not {value}")
-
     @property
     def stable(self) -> bool:
         """Whether the attitude loop is stable by itself: k_omega > tau k_R (Hurwitz)."""
@@ -251,17 +240,8 @@ def formation_loops(
     edges : (m, 2) agents from 0
     masses : (N,) [kg]
     lags : of each agent
-
-    Raises
-    ------
-    ValueError
-        The number of lags or masses is not that of the agents.
     """
     r, m = np.asarray(positions, dtype=np.float64), np.asarray(masses, dtype=np.float64)
-    n = len(r)
-    for name, count in (("lags", len(lags)), ("masses", len(m))):
-        if count != n:
-            raise ValueError(f"{n} agents need {n} {name}, one each, not {count}")
     S = constraint_share_of_input(r, np.asarray(edges, dtype=np.int64).reshape(-1, 2), m, law)
     rigid = rigid_motions(r, m)
     Q = rigid @ rigid.T
@@ -461,19 +441,18 @@ def _logarithms_of_loci(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes]:
         return np.zeros(0), np.zeros((0, len(loop.S)), np.complex128)
     omega = np.geomspace(_FREQUENCIES[0], end, _SAMPLES)
     values = _eigenvalues(loop.gain(1j * omega, law))
-    for _ in range(12):
+    # At most twelve times, each finer than the one before.
+    for left in range(12, -1, -1):
         loci = _continuous_logarithms(np.log(np.where(values == 0, 1e-300, values)))
         step = np.abs(np.diff(loci, axis=0))
         # Where loci are fainter than the threshold, they turn as they please.
         step[np.maximum(loci[1:].real, loci[:-1].real) < math.log(_FAINT)] = 0.0
         coarse = np.flatnonzero(step.max(axis=1) > _STEP)
-        if not len(coarse):
+        if not (left and len(coarse)):
             break
         middle = np.sqrt(omega[coarse] * omega[coarse + 1])
         omega = np.insert(omega, coarse + 1, middle)
         values = np.insert(values, coarse + 1, _eigenvalues(loop.gain(1j * middle, law)), axis=0)
-    else:
-        loci = _continuous_logarithms(np.log(np.where(values == 0, 1e-300, values)))
     return omega, loci
 
 
