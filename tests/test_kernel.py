@@ -921,30 +921,6 @@ def test_arrays_have_the_extents_that_the_kernel_is_compiled_for(mission, monkey
     assert {"Problem", "Workspace", "IntegratorState", "Monitor", "Record", "Segment"} <= seen
 
 
-def test_the_kernel_for_three_agents_is_the_kernel(monkeypatch):
-    """Of the same source, but for the lengths of its loops: the same flight to rounding."""
-    own = simulate("narrow-passage")
-    code = native.library()
-    monkeypatch.setitem(
-        native._loaded, "flight", native.Library(**vars(code) | {"integrate_three": code.integrate})
-    )
-    other = simulate("narrow-passage")
-    assert own.statistics["steps"] == other.statistics["steps"]
-    assert np.abs(own.position - other.position).max() < 1e-9
-
-
-def test_the_kernel_for_three_agents_is_for_them_alone(monkeypatch):
-    def refused(*_: int) -> int:
-        raise AssertionError("called")
-
-    code = native.library()
-    monkeypatch.setitem(
-        native._loaded, "flight", native.Library(**vars(code) | {"integrate_three": refused})
-    )
-    for mission in ("two-agents", "square", "hexagon"):
-        assert simulate(mission).complete
-
-
 def places_by_number() -> list[str]:
     """Where the package reads places of an array of codes by a number, and not by a name; `[:0]` reads none."""
     root, lines = Path(rigidfleet.__file__).parent, []

@@ -315,27 +315,6 @@ def test_an_attitude_that_is_unstable_by_itself():
     assert largest_stable_pole(tracking_loops([lag]), LoopGains()) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
-        ({"k_R": 0.0, "k_omega": 1.0}, "k_R of a vehicle must be positive, not 0.0"),
-        ({"k_R": 1.0}, "k_omega of a vehicle must be positive, not nan"),
-        ({"point": True, "delay": -1.0}, "delay of a vehicle must be finite and >= 0"),
-        ({"point": True, "rate": 0.0}, "rate of a vehicle must be positive, not 0.0"),
-    ],
-)
-def test_bad_lags(bad, message):
-    """A lag that cannot be is refused, by name and value."""
-    with pytest.raises(ValueError, match=message):
-        Lag(**bad)
-
-
-def test_every_agent_needs_a_lag():
-    """Too few lags or masses are refused."""
-    with pytest.raises(ValueError, match="3 agents need 3 lags"):
-        formation_loops(LINE, [[0, 1]], np.ones(3), LoopGains(), [LIGHT])
-
-
 def told(mission, lag):
     with patch("rigidfleet.preflight.check.vehicle_lags", lambda _: [lag] * mission.n_agents):
         found = check(mission, search=False)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from vehicle_samples import PAPER, ROTORPY, G, begun, derivatives, planned, rotorpy
+from vehicle_samples import PAPER, ROTORPY, G, begun, derivatives, planned, rotorpy, with_trail
 
 from rigidfleet.kernel import fleet, records
 from rigidfleet.kernel.engine import native, sampled
@@ -75,7 +75,7 @@ def everything(rows: int = 0) -> tuple[Any, ...]:
         ),
     )  # fmt: skip
     S = fleet.hover_states(vehicles, load_mission("cube-passage").agents.position, np.zeros((n, 3)))
-    return problem, work, flight, fleet.initial_state(flight, S, work, rows=rows)
+    return problem, work, flight, with_trail(fleet.initial_state(flight, S, work), rows)
 
 
 def test_a_pause_changes_no_bit():

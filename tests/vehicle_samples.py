@@ -27,6 +27,7 @@ from rigidfleet.kernel.problem import (
     no_disturbance,
     workspace,
 )
+from rigidfleet.kernel.records import NO_TRAIL, Trail
 from rigidfleet.mission import load_mission
 from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
@@ -128,7 +129,14 @@ def begun(
     problem, work = open_problem(fleet_), workspace(n, 0)
     problem.control.force[:, 2] = fleet_.m * G
     S = fleet.hover_states(fleet_, 10.0 * np.eye(n, 3) if r is None else r, np.zeros((n, 3)))
-    return problem, work, flight, fleet.initial_state(flight, S, work, rows=rows)
+    return problem, work, flight, with_trail(fleet.initial_state(flight, S, work), rows)
+
+
+def with_trail(state: fleet.SampledState, rows: int) -> fleet.SampledState:
+    """The state with a trail into which so many steps fit."""
+    points, none = np.empty((rows, 5, 6 * len(state.S))), np.zeros((rows, 0))
+    trail = Trail(np.empty((rows, 2)), points, none, np.zeros(0))
+    return state._replace(trail=trail if rows else NO_TRAIL)
 
 
 def planned(
@@ -144,7 +152,7 @@ def planned(
     flight = fleet.ideal_flight(fleet_, start=plan.start, h=h, steps=steps, every=every)
     work = workspace(n, len(plan.edges), solver=plan.problem.law.solver)
     S = fleet.hover_states(fleet_, now.r, now.v)
-    return plan.problem, work, flight, fleet.initial_state(flight, S, work, rows=rows)
+    return plan.problem, work, flight, with_trail(fleet.initial_state(flight, S, work), rows)
 
 
 def random_states(vehicle: fleet.VehicleDynamics, n: int, seed: int) -> tuple[np.ndarray, ...]:

@@ -71,24 +71,16 @@ def _closest_approaches(
         y = q[:, i, None] - q[:, None, first + 1 :]
         y -= x
         # Nearest point to zero of the segment from x to x + y.
-        s = _dot(x, y)
-        s /= -np.maximum(_dot(y, y), 1e-300)
+        s = (x * y).sum(axis=0)
+        s /= -np.maximum((y * y).sum(axis=0), 1e-300)
         np.clip(s, 0.0, 1.0, out=s)
         y *= s
         y += x
-        separation = np.sqrt(_dot(y, y))
+        separation = np.sqrt((y * y).sum(axis=0))
         separation -= r[i, None] + r[first + 1 :]
         separation[np.tri(*separation.shape, -1, dtype=np.bool_)] = np.inf  # each pair once
         yield i, separation, s
         first = int(i[-1]) + 1
-
-
-def _dot(x: Floats, y: Floats) -> Floats:
-    """Scalar products (...) of vectors (3, ...)."""
-    z = x[0] * y[0]
-    z += x[1] * y[1]
-    z += x[2] * y[2]
-    return z
 
 
 def assign_slots(

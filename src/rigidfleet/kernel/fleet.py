@@ -297,7 +297,6 @@ class SampledSegment(NamedTuple):
     f_u: Floats  # (K, N, 3)
     f_C: Floats  # (K, N, 3)
     seen: Floats  # (K, N, 6)
-    air: Floats  # (K, N, 3) velocity of the air [m/s]
     saturated: Bools  # (K, N)
     layers: Ints  # (K, N)
     tau: Floats  # (K, N, 3) clocks: tau - t [s], dtau/dt, ds/dt [1/s]
@@ -418,10 +417,9 @@ def initial_state(
     workspace: Workspace,
     *,
     frame: Floats | None = None,
-    rows: int = 0,
     iterations: int = 1,
 ) -> SampledState:
-    """State of a flight at its start, from states ``S`` (N, 17); ``rows`` steps fit into the trail.
+    """State of a flight at its start, from states ``S`` (N, 17), without a trail.
 
     With a network, the constraint law has some ``iterations``.
     """
@@ -437,10 +435,6 @@ def initial_state(
     times = np.full(worst.shape, flight.start)
     mail = empty_mail(flight.network, iterations)
     mail.estimate[:, :3] = S[: len(mail.estimate), 3:6]
-    trail = NO_TRAIL
-    if rows:
-        none = np.zeros(0)
-        trail = Trail(np.empty((rows, 2)), np.empty((rows, 5, 6 * n)), np.zeros((rows, 0)), none)
     return SampledState(
         S=S.copy(), clock=np.array([flight.start, flight.start]), count=np.zeros(ANSWERED + 1, dtype=np.int64),
         integral=np.zeros(m), frame=attitude, error=np.zeros((n, 3)),
@@ -448,7 +442,7 @@ def initial_state(
         command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_),
         layers=np.zeros(n, dtype=np.int64), seen=known, history=past,
         mail=mail, tau=clocks_at_start(n), peak=peak, peak_time=times[:, :4].copy(),
-        worst=worst, worst_time=times, saturations=np.zeros(n, dtype=np.int64), trail=trail,
+        worst=worst, worst_time=times, saturations=np.zeros(n, dtype=np.int64), trail=NO_TRAIL,
         work=_new_work_arrays(n, m),
     )  # fmt: skip
 
@@ -492,7 +486,7 @@ def sampled_segment(
     k = len(at)
     return SampledSegment(
         t_end, max_steps, 0, 0, 0, 0, 0, at, np.empty((k, n, STATES)), np.empty((k, n, STATES)), np.empty((k, n, 4)),
-        np.empty((k, n, 3)), np.empty((k, n, 3)), np.empty((k, n, 6)), np.empty((k, n, 3)),
-        np.empty((k, n), dtype=np.bool_), np.empty((k, n), dtype=np.int64), np.empty((k, n, 3)), np.empty((k, m)),
+        np.empty((k, n, 3)), np.empty((k, n, 3)), np.empty((k, n, 6)), np.empty((k, n), dtype=np.bool_),
+        np.empty((k, n), dtype=np.int64), np.empty((k, n, 3)), np.empty((k, m)),
         np.empty((k, 4)), np.empty((k, links), dtype=np.int64),
     )  # fmt: skip

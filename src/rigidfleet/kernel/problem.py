@@ -1,7 +1,7 @@
 """One phase of a flight as arrays, written by `plan` and read by the kernel.
 
 Short names are the paper's; every array is C-contiguous float64 (edges: uint32). N agents, m edges. The kernel is
-compiled with the extents that types of arrays declare here, and once more with N = m = 3 (see `compiler.pointers`).
+compiled with the extents that types of arrays declare here as numbers (see `compiler.pointers`).
 """
 
 import math

@@ -17,9 +17,6 @@ PerEdgeInTime = Annotated[Floats, Extents((None, "m"))]
 Corners = Annotated[Floats, Extents((None, 6))]
 Pairs = Annotated[Ints, Extents((None, 2))]
 
-#: Of a `Recursion` that makes no rows, and of one that adds none.
-NO_ROWS, NO_FACTORS = np.zeros((0, 0)), np.zeros(0)
-
 #: Return values of an integration; a sampled flight asks for the forces of vehicles that follow laws of their own.
 FINISHED, PAUSED, COLLAPSED, ASKS = range(4)
 #: Places in `IntegratorState.clock`: the time [s], the next step to try [s], the logarithm of the last error.
@@ -244,10 +241,6 @@ class Recursion(NamedTuple):
     x: Floats  # (K, M)
     a: Floats  # (K,)
     backward: bool  # whether the rows are followed from the last to the first
-    # rows (K, C) of which x is made, from a column on, times a number (K,) each; without rows, x is as it is
-    y: Floats = NO_ROWS
-    first: int = 0
-    b: Floats = NO_FACTORS
 
 
 class Order(NamedTuple):

@@ -448,7 +448,6 @@ def write_samples(t, h, p, flight, state, call):
                 call.command[c, i, q] = state.command[i, q]
             for q in range(3):
                 call.f_u[c, i, q], call.f_C[c, i, q] = state.f_u[i, q], state.f_C[i, q]
-                call.air[c, i, q] = work.air[2, i, q]
             for q in range(6):
                 call.seen[c, i, q] = state.seen[i, q] + path_at(
                     count[TICKS] - 1, i, q, flight.tables

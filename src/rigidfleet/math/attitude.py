@@ -135,16 +135,7 @@ def euler_from_dcm(T: ArrayLike) -> Floats:
 
 def quaternion_from_euler(euler: ArrayLike) -> Floats:
     """Unit quaternions (..., 4) with q0 >= 0 of Euler angles (..., 3) = (roll, pitch, yaw) [rad]."""
-    half = 0.5 * np.moveaxis(_check_vectors("euler", euler, 3), -1, 0)
-    sr, sp, sy = np.sin(half)
-    cr, cp, cy = np.cos(half)
-    q = [
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    ]
-    return _scalar_positive(np.stack(q, axis=-1))
+    return quaternion_from_dcm(dcm_from_euler(euler))
 
 
 def euler_from_quaternion(q: ArrayLike) -> Floats:

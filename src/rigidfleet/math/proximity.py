@@ -23,8 +23,6 @@ _MANY = 200
 _ASKED = 256
 
 
-# Distance of the pairs listed, as a multiple of the least distance.
-_SPARE = 1.2
 # Number of values that fit into the processor's cache.
 CACHED = 60_000
 
@@ -116,67 +114,26 @@ def root_of_squares(d: Floats) -> Floats:
 
 
 def _closest_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
-    """`separation` of many agents r (K, N, 3), all finite, in O(N) or O(N log N) per sample.
-
-    A tree finds the near pairs at one sample. They are used for later samples as long as no other pair can have come
-    as near: apart from rigid motion of the whole, agents that have moved by at most some way
-    (`_greatest_deformation`) have changed no distance by more than twice that.
-    """
-    least, pair = np.empty(len(r)), np.empty((len(r), 2), dtype=np.int64)
-    near, rest = None, np.zeros((3, 0))
-    for k, points in enumerate(r):
-        # In this layout, sums over agents take a quarter of the time
-        p = np.ascontiguousarray(points.T)
-        p -= p.mean(axis=1, keepdims=True)
-        if near is not None:
-            apart = near.separations(p)
-            at = int(apart.argmin())
-        if near is None or apart[at] > near.beyond - 2.0 * _greatest_deformation(rest, p):
-            near, rest = _pairs_near_least(p, radius), p
-            apart = near.separations(p)
-            at = int(apart.argmin())
-        least[k], pair[k] = apart[at], near.pairs[:, at]
-    return least, pair
-
-
-class _Near(NamedTuple):
-    """Near pairs of agents (2, m), i < j, and sums of their radii (m,); all others are ``beyond`` [m] apart or more."""
-
-    pairs: Ints
-    radii: Floats
-    beyond: float
-
-    def separations(self, p: Floats) -> Floats:
-        """Distances (m,) [m] between the surfaces of the pairs, for agents p (3, N)."""
-        x = p.take(self.pairs[0], axis=1)
-        x -= p.take(self.pairs[1], axis=1)
-        x *= x
-        return np.sqrt(x[0] + x[1] + x[2]) - self.radii
-
-
-def _pairs_near_least(p: Floats, radius: Floats) -> _Near:
-    """The pairs of agents p (3, N) that are not much farther apart than the closest two."""
+    """`separation` of many agents r (K, N, 3), all finite, in O(N log N) per sample: a tree finds the near pairs."""
     from scipy.spatial import KDTree
 
-    # Balancing the tree costs more than it saves here. A few agents give an estimate of the least distance.
-    tree = KDTree(p.T, balanced_tree=False, compact_nodes=False)
+    least, pair = np.empty(len(r)), np.empty((len(r), 2), dtype=np.int64)
     some = np.arange(0, len(radius), max(1, len(radius) // _ASKED))
-    d, j = tree.query(p.T[some], k=2)
-    widest, rounding = 2.0 * float(radius.max()), 1e-9 * float(np.abs(p).max())
-    estimate = float((d[:, 1] - radius[some] - radius[j[:, 1]]).min())
-    pairs = tree.query_pairs(_SPARE * (estimate + widest) + rounding, output_type="ndarray").T
-    candidates = _Near(pairs, radius[pairs].sum(axis=0), 0.0)
-    separations = candidates.separations(p)
-    beyond = _SPARE * (float(separations.min()) + widest) + rounding - widest
-    near = separations <= beyond
-    return _Near(np.ascontiguousarray(pairs[:, near]), candidates.radii[near], beyond)
-
-
-def _greatest_deformation(before: Floats, after: Floats) -> float:
-    """Greatest displacement [m] of an agent, from (3, N) to (3, N), after removing the rigid motion of all."""
-    U, _, Vt = np.linalg.svd(after @ before.T)
-    moved = after - (U @ Vt) @ before  # a reflection also preserves distances
-    return float(np.sqrt(np.einsum("ai,ai->i", moved, moved).max()))
+    for k, points in enumerate(r):
+        p = np.ascontiguousarray(points.T)
+        p -= p.mean(axis=1, keepdims=True)
+        # Balancing the tree costs more than it saves here. A few agents give an estimate of the least distance.
+        tree = KDTree(p.T, balanced_tree=False, compact_nodes=False)
+        d, j = tree.query(p.T[some], k=2)
+        # Of two agents at the same place, either may be found as its own nearest one.
+        other = np.where(j[:, 1] == some, j[:, 0], j[:, 1])
+        estimate = float((d[:, 1] - radius[some] - radius[other]).min())
+        reach = estimate + 2.0 * float(radius.max()) + 1e-9 * float(np.abs(p).max())
+        near = tree.query_pairs(reach, output_type="ndarray").T
+        apart = root_of_squares(p[:, near[0]] - p[:, near[1]]) - radius[near].sum(axis=0)
+        at = int(apart.argmin())
+        least[k], pair[k] = apart[at], near[:, at]
+    return least, pair
 
 
 def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[Floats, Ints]:

@@ -38,14 +38,10 @@ def correlate_evenly(white: Floats, correlation: float) -> Floats:
 
 def correlate_by_distance(white: Floats, points: ArrayLike, length: float) -> Floats:
     """Samples (..., N, 3) with the correlation exp(-distance / length) between agents at points (N, 3) [m]."""
-    mixing = _correlation_root(np.asarray(points, dtype=np.float64), length)
+    p = np.asarray(points, dtype=np.float64)
+    apart = np.linalg.norm(p[:, None] - p, axis=2)
+    # Nearly coincident places would make the matrix singular to rounding.
+    mixing = np.linalg.cholesky(np.exp(-apart / length) + 1e-12 * np.eye(len(p)))
     by_axis = np.moveaxis(white, -1, 0)
     mixed = by_axis.reshape(-1, len(mixing)) @ mixing.T  # one product, not many small ones
     return np.moveaxis(mixed.reshape(by_axis.shape), 0, -1)
-
-
-def _correlation_root(points: Floats, length: float) -> Floats:
-    """The lower root (N, N) of the correlations."""
-    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
-    # Nearly coincident places would make the matrix singular to rounding.
-    return np.linalg.cholesky(np.exp(-apart / length) + 1e-12 * np.eye(len(points)))

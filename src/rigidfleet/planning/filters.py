@@ -95,11 +95,12 @@ def spline_coefficients(samples: Floats, scale: float = 1.0, part: int | None = 
     """
     from rigidfleet.kernel.engine import native
 
-    n, shape = len(samples), samples.shape[1 if part is None else 2 :]
-    flat, width = np.ascontiguousarray(samples).reshape(n, -1), math.prod(shape)
-    table = np.empty((n + 2, width))
+    y = samples if part is None else samples[:, part]
+    n, shape = len(y), y.shape[1:]
+    table = np.empty((n + 2, math.prod(shape)))
     c, (factors, shares) = table[1:-1], _tridiagonal_factors(n)
-    native.run_scaled_recursions(flat, (part or 0) * width, scale * shares, c, factors)
+    np.multiply((scale * shares)[:, None], y.reshape(n, -1), out=c)
+    native.run_linear_recursion(c, factors)
     native.run_linear_recursion(c, factors, backward=True)
     table[0], table[-1] = 2.0 * c[0] - c[1], 2.0 * c[-1] - c[-2]
     return table.reshape(n + 2, *shape)

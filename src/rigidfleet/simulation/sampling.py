@@ -36,12 +36,8 @@ class Sampling:
         passed = (at["time"] for at in plan.through)
         for exact in dict.fromkeys((plan.arrival, plan.t_end, stop, *passed, *losses)):
             if t < exact <= t_end:
-                near = 1e-9 * step
-                before, after = (
-                    grid.searchsorted(exact - near),
-                    grid.searchsorted(exact + near, "right"),
-                )
-                grid = np.concatenate([grid[:before], (exact,), grid[after:]])
+                others = grid[np.abs(grid - exact) > 1e-9 * step]  # not the same but for rounding
+                grid = np.sort(np.append(others, exact))
         if not first:
             return grid
         start = t if t == 0.0 else math.nextafter(t, math.inf)
@@ -56,12 +52,7 @@ def requested_times(times: ArrayLike, end: float) -> Floats:
     ValueError
         A time lies outside the mission.
     """
-    t = _sort_distinct(as_numbers("times to record [s]", times))
+    t = np.unique(as_numbers("times to record [s]", times))
     if not (len(t) and t[0] >= 0.0 and t[-1] <= end * (1.0 + 1e-12)):
         raise ValueError(f"times to record must lie between 0 and the mission's end, {end:g} s")
-    return t if t[-1] <= end else _sort_distinct(np.minimum(t, end))
-
-
-def _sort_distinct(t: Floats) -> Floats:
-    """Times (K,) sorted, each once; a copy, of which a flight records parts."""
-    return t.copy() if t.ndim == 1 and (t[1:] > t[:-1]).all() else np.unique(t)
+    return t if t[-1] <= end else np.unique(np.minimum(t, end))

@@ -6,14 +6,10 @@ A `Pointer` is the address of a named tuple laid out in words of eight bytes: a 
 lanes takes eight), an array the words of its data address and shape, a nested tuple the words of its fields. Reading a
 field loads its words. They never change while compiled code runs, and the compiler knows this.
 
-Extents of arrays that the tuple's type declares (`rigidfleet.kernel.problem.Extents`) are not loaded. An extent with a
-name passes through a function that returns what it is given; `set_extents` replaces this function, and makes code for a
-size of the same translation, if `keep_extents` was called before it.
+Extents of arrays that the tuple's type declares as numbers (`rigidfleet.kernel.problem.Extents`) are not loaded.
 """
 
 import hashlib
-import re
-from collections.abc import Mapping
 from typing import Any
 
 from llvmlite import ir
@@ -35,8 +31,6 @@ _WORD = ir.IntType(64)
 _ADDRESS = _WORD.as_pointer()
 #: Part of a named tuple that may be read in advance [bytes]; there are no registers for more.
 _AHEAD = 256
-#: The function through which a named extent passes, and whether calls of it are inlined at once.
-_NAMED, _inlining = "rigidfleet_extent_{}", ["alwaysinline"]
 
 
 class Pointer(types.Type):
@@ -95,7 +89,10 @@ def _read_field(context: Any, builder: Any, kind: Any, address: Any, name: str) 
         array = context.make_array(field)(context, builder)
         array.data = _load(builder, address, first, array.data.type)
         extents = extents_of(kind.to.instance_class).get(name, (None,) * field.ndim)
-        shape = [_load_extent(builder, address, first + 1 + k, x) for k, x in enumerate(extents)]
+        shape = [
+            ir.Constant(_WORD, x) if isinstance(x, int) else _load(builder, address, first + 1 + k)
+            for k, x in enumerate(extents)
+        ]
         return _array_at(context, builder, field, array, shape)
     if field == types.boolean:
         return builder.trunc(_load(builder, address, first), ir.IntType(1))
@@ -111,46 +108,6 @@ def _load(builder: Any, address: Any, word: int, kind: ir.Type = _WORD) -> Any:
     loaded = builder.load(place, align=8)
     loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
     return loaded
-
-
-def _load_extent(builder: Any, address: Any, word: int, declared: int | str | None) -> Any:
-    if isinstance(declared, int):
-        return ir.Constant(_WORD, declared)
-    loaded = _load(builder, address, word)
-    if declared is None:
-        return loaded
-    name, kind = _NAMED.format(declared), ir.FunctionType(_WORD, [_WORD])
-    function = builder.module.globals.get(name)
-    if function is None:
-        function = ir.Function(builder.module, kind, name)
-        function.linkage = "linkonce_odr"
-        function.attributes.add(_inlining[0])
-        ir.IRBuilder(function.append_basic_block()).ret(function.args[0])
-    return builder.call(function, [loaded])
-
-
-def keep_extents() -> None:
-    """Keep the functions of named extents, in what is translated from now on, until `set_extents` replaces them."""
-    _inlining[0] = "noinline"
-
-
-def set_extents(text: str, sizes: Mapping[str, int]) -> str:
-    """A module's text in which named extents are these numbers; those not given are as they come.
-
-    Raises RuntimeError if the text has no such extent.
-    """
-    named = set()
-
-    def inline(function: re.Match[str]) -> str:
-        named.add(function[2])
-        extent = sizes.get(function[2], "%x")
-        return f"define linkonce_odr i64 @{function[1]}(i64 %x) alwaysinline {{ ret i64 {extent} }}"
-
-    definition = rf'^define [^\n]*@"?({_NAMED.format("([A-Za-z])")})"?\(.*?^}}'
-    text = re.sub(definition, inline, text, flags=re.DOTALL | re.MULTILINE)
-    if missing := sizes.keys() - named:
-        raise RuntimeError(f"the translated kernel has no extents {', '.join(sorted(missing))}")
-    return text
 
 
 def _array_at(context: Any, builder: Any, kind: types.Array, array: Any, shape: list[Any]) -> Any:

@@ -11,7 +11,6 @@ shares little with the integrator meanwhile.
 import re
 import subprocess
 import sys
-from collections.abc import Mapping
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -29,7 +28,7 @@ from rigidfleet.kernel import (
 )
 from rigidfleet.kernel.avoidance import AvoidanceArrays
 from rigidfleet.kernel.compiler.jit import OPTIONS
-from rigidfleet.kernel.compiler.pointers import Pointer, keep_extents, pointer_to, set_extents
+from rigidfleet.kernel.compiler.pointers import Pointer, pointer_to
 from rigidfleet.kernel.engine import objects, packing
 from rigidfleet.kernel.measured import Measured
 from rigidfleet.kernel.problem import Problem, Workspace
@@ -45,11 +44,6 @@ _HOT = (
 )  # fmt: skip
 #: The same of sampled flights.
 _HOT_SAMPLED = ("attitude_matrix", "quaternion_rate", "thrust_of", "speed_of")
-#: Extents of the triangle, the paper's first formation, for which the integrator is compiled once more: loops of known
-#: length save a fifth of the time.
-THREE = {"N": 3, "m": 3, "P": 3, "A": 3}
-#: No extents: code for any number of agents.
-ANY: Mapping[str, int] = {}
 #: Functions of the solver of large formations that return a number.
 _RETURNING = {"solve", "count_blocks", "factor", "inner", "conjugate_gradients"}
 #: Passes that simplify each translated function before inlining.
@@ -72,15 +66,10 @@ def flight_object_code(second: "subprocess.Popen[bytes] | None" = None) -> list[
         recorder.write_record(call.times, call.samples, p, w, call.dy, out, call.first)
         return 0
 
-    keep_extents()
     integrated, recorded = (IntegratorState, Segment), (Segment, Record)
     integration = _ir_text(integrate_segment, Problem, Workspace, *integrated, result=types.int64)
     recording = _ir_text(record_segment, Problem, Workspace, *recorded, result=types.int64)
-    codes = [
-        _object_code(*integration, "integrate"),
-        _object_code(*integration, "integrate_three", sizes=THREE),
-        _object_code(*recording, "record"),
-    ]
+    codes = [_object_code(*integration, "integrate"), _object_code(*recording, "record")]
     made = None if second is None else objects.split_objects(second.communicate()[0])
     return [*codes, *(made or monitor_object_code())]
 
@@ -177,15 +166,9 @@ def _ir_text(function: Any, *arguments: Any, result: Any = types.void) -> tuple[
     return made.inspect_llvm(), made.native_name
 
 
-def _object_code(
-    text: str,
-    symbol: str,
-    name: str,
-    hot: tuple[str, ...] = _HOT,
-    sizes: Mapping[str, int] = ANY,
-) -> bytes:
-    """Object code of a module of which ``symbol`` alone, the function ``name``, is called; see `set_extents`."""
-    module = _simplify(set_extents(text, sizes), symbol, name, hot)
+def _object_code(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) -> bytes:
+    """Object code of a module of which ``symbol`` alone, the function ``name``, is called."""
+    module = _simplify(text, symbol, name, hot)
     builder = _pass_builder(3)
     builder.getModulePassManager().run(module, builder)
     for function in module.functions:
@@ -196,7 +179,7 @@ def _object_code(
     return objects.target_machine().emit_object(module)
 
 
-def _simplify(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) -> llvm.ModuleRef:
+def _simplify(text: str, symbol: str, name: str, hot: tuple[str, ...]) -> llvm.ModuleRef:
     """Return a module of which ``symbol`` alone, the function ``name``, is called from outside; ``hot`` is inlined."""
     # Only addresses of named tuples are declared dereferenceable, and these are never written.
     module = llvm.parse_assembly(re.sub(r"(?=dereferenceable\(\d+\))", "readonly ", text))

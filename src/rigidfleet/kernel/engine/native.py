@@ -80,10 +80,7 @@ class Integration:
         self._segment = pack_uncached(Segment(t_end, False, 0, times, samples, NOTHING))
         self._kept = pack(problem), pack(workspace), pack(state), self._segment
         self._addresses = [x.address for x in self._kept]
-        code, graph = library(), problem.graph
-        sizes = len(problem.vehicles.m), len(graph.edges), len(graph.pairs), len(workspace.A)
-        three = sizes == (3, 3, 3, 3)
-        self._integrate = code.integrate_three if three else code.integrate
+        self._integrate = library().integrate
 
     def __call__(self, fresh: bool, max_steps: int) -> int:
         """Do at most so many steps; ``fresh`` as in `Segment`. Returns what `dopri5.integrate` returns."""
@@ -162,11 +159,6 @@ def measure_samples(measured: Measured) -> None:
 def run_linear_recursion(x: Floats, a: Floats, *, backward: bool = False) -> None:
     """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward; see `kernel.recursion.run_linear_recursion`."""
     _call_packed(library().follow, pack_uncached(Recursion(x, a, backward)))
-
-
-def run_scaled_recursions(y: Floats, first: int, b: Floats, x: Floats, a: Floats) -> None:
-    """x_k = b_k y_k + a_k x_(k-1) in rows x (K, M), from the M columns of y (K, C) that begin with ``first``."""
-    _call_packed(library().follow, pack_uncached(Recursion(x, a, False, y, first, b)))
 
 
 def call_large(name: str, *arguments: Any) -> float:

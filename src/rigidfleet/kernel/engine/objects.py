@@ -26,7 +26,6 @@ ENTRIES = {
         "watch_forces": 5,  # last, problem, workspace, integrator, monitor
         "measure": 1,
         "follow": 1,
-        "integrate_three": 4,  # the first, for three agents with three edges
     },
     "sampled": {"fly_ticks": 5},
     "avoidance": {"avoid": 4},  # flight, state, avoidance, 0
