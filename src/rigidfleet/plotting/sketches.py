@@ -11,9 +11,8 @@ import numpy as np
 from rigidfleet.formation import distance_geometry
 from rigidfleet.plotting import curves
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.space import camera_axes
 from rigidfleet.result import Result
-from rigidfleet.result.lights import plane_view
+from rigidfleet.result.lights import camera_axes, plane_view
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -116,9 +115,9 @@ def draw_formation_sketch(
     flat = thin and distance_geometry.dimension(p, 1e-3) < 3
     turn, lit = np.eye(3), mission.formation_colours(name)
     if lit:
-        turn = camera_axes(*np.degrees(plane_view(p)))
+        turn = camera_axes(*plane_view(p))
     elif sideways or not flat:
-        turn = camera_axes(-70.0, 30.0 if flat else 16.0)
+        turn = camera_axes(*np.radians([-70.0, 30.0 if flat else 16.0]))
     words += "" if placed else "; their distances fix no positions"
     ax.set_title(st.clean_name(name), pad=22, fontsize=9, fontweight="bold", parse_math=False)
     at: dict[str, Any] = {"transform": ax.transAxes, "ha": "center", "parse_math": False}

@@ -339,11 +339,3 @@ def trajectory(result: Result) -> Figure:
         handles=entries, loc="lower center", ncols=columns, borderaxespad=0.8, columnspacing=1.4
     )
     return fig
-
-
-def camera_axes(azimuth: float, elevation: float) -> Floats:
-    """Unit vectors right, up and towards the viewer (rows) of a camera at these angles [deg]."""
-    a, e = math.radians(azimuth), math.radians(elevation)
-    out = np.array([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)])
-    right = np.array([-math.sin(a), math.cos(a), 0.0])
-    return np.array([right, np.cross(out, right), out])
