@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,10 +25,9 @@ _TEXT_ROW = 0.35  # height of a row that holds only text
 
 def rotor_limits(mission: Mission) -> Floats:
     """Maximum thrust (N,) of a rotor of each vehicle [N]; NaN for points, which have none."""
-    models = mission.vehicle_models
-    if models is None:
-        return np.full(mission.n_agents, np.nan)
-    return np.array([math.nan if model.point else model.rotor_limit for model in models])
+    limits = np.zeros(mission.n_agents)
+    limits[:] = QUANTITIES["rotor_force"].limit_of(mission) or 0.0
+    return np.where(limits > 0.0, limits, np.nan)
 
 
 def has_rotors(result: Result) -> bool:
