@@ -626,11 +626,8 @@ class Aborts:
 
     def _abort_of_leavers(self, ordered: float) -> Abort:
         """Some vehicles go home, as soon as they come near no other one; the others fly the plan on."""
-        begins, end, who = (
-            ordered + self.options.reaction,
-            self.plan_end,
-            self._aborts_of_leavers.left,
-        )
+        begins, end = ordered + self.options.reaction, self.plan_end
+        who = self._aborts_of_leavers.left
         order = np.concatenate([who, np.setdiff1d(self.left, who)])
         problem = "there is no time left"
         plan = self.step_by_clock("", _path_clock(begins, max(end - begins, SHORTEST), _ON)).least

@@ -41,7 +41,7 @@ class Certificate(NamedTuple):
 
 
 def certificate_of(
-    phase: Phase, reference: Reference, radius: Floats, lost: Bools | None = None
+    phase: Phase, reference: Reference, radius: Floats, lost: Bools
 ) -> Certificate | None:
     """Certificate of a phase whose agents track slots; None if they do not, if slots jump, or for a single agent.
 
@@ -53,7 +53,7 @@ def certificate_of(
 
 
 def certificate_in_step(
-    start: Floats, end: Floats, duration: float, radius: Floats, lost: Bools | None = None
+    start: Floats, end: Floats, duration: float, radius: Floats, lost: Bools
 ) -> Certificate | None:
     """Certificate of straight septic blends (N, 3) [m] in step from 0 on [s]; the rest as `certificate_of`."""
     none, ways = np.zeros(0), end - start
@@ -61,19 +61,15 @@ def certificate_in_step(
     return _prove_some(reference, radius, lost)
 
 
-def _prove_some(reference: Reference, radius: Floats, lost: Bools | None) -> Certificate | None:
+def _prove_some(reference: Reference, radius: Floats, lost: Bools) -> Certificate | None:
     """Certificate of the slots of vehicles that are not ``lost`` (N,)."""
-    left = None if lost is None else np.flatnonzero(~lost)
-    if left is not None:
-        reference, radius = reference_of_agents(reference, left), radius[left]
-    if len(radius) < 2:
+    left = np.flatnonzero(~lost)
+    if len(left) < 2:
         return None
-    some = reference
+    some, radius = reference_of_agents(reference, left), radius[left]
     certificate = (
         prove_ways(some.knots, some.ways, radius) if len(some.knots) else prove_blend(some, radius)
     )
-    if left is None:
-        return certificate
     i, j = (int(left[k]) for k in certificate.agents)
     return certificate._replace(agents=(i, j))
 

@@ -279,10 +279,9 @@ def plan_phase(
         loses=min(mission.first_loss, mission.abandons_at) < math.inf,
         through=points_passed(phase.points, motion),
     )  # fmt: skip
-    lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
     parted = plan.links_lost[1] <= now.t
-    if lost.any() or parted.any():
-        plan.remove_lost_edges(lost, parted)
+    if now.lost.any() or parted.any():
+        plan.remove_lost_edges(now.lost, parted)
     return plan
 
 
@@ -326,8 +325,7 @@ def _name_if_in_formation(mission: Mission, name: str | None, now: PhaseState) -
     slots = mission.formation_slots(name) if name else None
     if slots is None:
         return None
-    left = slice(None) if now.lost is None else ~now.lost
-    slots, r = slots[left], now.r[left]
+    slots, r = slots[~now.lost], now.r[~now.lost]
     if len(slots) < 2:
         return None
     pairs = graphs.complete_graph(len(slots))

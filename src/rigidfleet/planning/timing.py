@@ -131,10 +131,8 @@ def timed_leg(
     phase = _with_point_times(mission, phase, departure)
     shortest, vary = _SHORTEST, partial(_with_travel, phase)
     if phase.duration == AUTO and phase.shaping is not None and phase.shaping.blend != AUTO:
-        shortest, vary = (
-            phase.shaping.least_time,
-            lambda t: phase.model_copy(update={"duration": t}),
-        )
+        shortest = phase.shaping.least_time
+        vary = lambda t: phase.model_copy(update={"duration": t})  # noqa: E731
     time, worst = _min_time(mission, vary, departure, shortest)
     if time is None:
         problem = f"no time keeps the limits of the mission: {reached_in_words(worst, phase)}"

@@ -68,10 +68,8 @@ def rotors(result: Result) -> Figure:
 def _draw_greatest_rotor(ax: Axes, result: Result) -> None:
     """The greatest of the four rotors of each vehicle, as a share of its limit."""
     limits = rotor_limits(result.mission)
-    share, between = (
-        100.0 * rotor_forces(result).max(axis=2) / limits,
-        _rotor_nearest_to_limit(result, limits),
-    )
+    share = 100.0 * rotor_forces(result).max(axis=2) / limits
+    between = _rotor_nearest_to_limit(result, limits)
     if between is not None:
         between = between._replace(value=100.0 * between.value / limits[between.who], other=-1)
     ax.set_ylabel("share of the rotor limit [%]")

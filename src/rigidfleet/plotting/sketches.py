@@ -13,6 +13,7 @@ from rigidfleet.plotting import curves
 from rigidfleet.plotting import style as st
 from rigidfleet.result import Result
 from rigidfleet.result.lights import camera_axes, plane_view
+from rigidfleet.solids.distance import vector_from_segment
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -160,7 +161,8 @@ def draw_graph(
         middle = a + (b - a) * (0.5 if np.hypot(*(a + b)[:2]) > 0.3 * room else 0.28)
         others = np.delete(p, [i, j], axis=0)
         path = np.array([a, b])[:, :2]
-        if len(others) and _distances_to_segment(others, a, b).min() < 0.02 * room:
+        beside = np.linalg.norm(vector_from_segment(*others.T, a, b), axis=0)
+        if beside.min(initial=room) < 0.02 * room:
             # A straight edge would run through another agent.
             across = np.array([a[1] - b[1], b[0] - a[0]]) * -0.22
             s = np.linspace(0, 1, 40)[:, None]
@@ -226,10 +228,3 @@ def _draw_body_axes(ax: Axes, axes: Floats, length: float) -> None:
         arrow = {"arrowstyle": "-|>", "color": st.INK, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 0}
         ax.annotate("", (x, y), (0, 0), zorder=4, arrowprops=arrow)
         ax.annotate(label, (1.1 * x, 1.1 * y), **look)
-
-
-def _distances_to_segment(points: Floats, a: Floats, b: Floats) -> Floats:
-    """Distances of points (n, 3) from the segment a b."""
-    along = b - a
-    s = np.clip((points - a) @ along / max(float(along @ along), 1e-300), 0.0, 1.0)
-    return np.linalg.norm(points - a - s[:, None] * along, axis=1)

@@ -92,10 +92,8 @@ def _waypoints(result: Result) -> list[tuple[str, Floats]]:
 
 def _waypoint_names_by_place(view: Scene, axes: int) -> list[tuple[str, Floats]]:
     """Names of the waypoints, of those joined that are at one place as it is seen in 2 or 3 axes."""
-    near, joined = (
-        _ONE_PLACE * np.linalg.norm(view.high - view.low),
-        list[tuple[list[str], Floats]](),
-    )
+    near = _ONE_PLACE * np.linalg.norm(view.high - view.low)
+    joined: list[tuple[list[str], Floats]] = []
     for name, place in view.waypoints:
         there = (names for names, at in joined if np.linalg.norm((at - place)[:axes]) < near)
         if (names := next(there, None)) is None:
