@@ -165,8 +165,8 @@ def permutation(n: int, seed: int) -> list[str]:
         }
     )
     planned, took = clocked(lambda: preview_phases(complete_times(mission))[0][1:])
-    least = min(p.certificate.separation for p in planned if p.certificate is not None)
-    assert all(p.certificate is not None for p in planned)
+    least = min(p.leg.certificate.separation for p in planned if p.leg.certificate is not None)
+    assert all(p.leg.certificate is not None for p in planned)
     makespan = float(planned[-1].time[-1] - planned[0].time[0])
     way = float(np.linalg.norm(grid[order] - grid, axis=1).max())
     alone = way / SPEED + SPEED / ACCELERATION

@@ -494,7 +494,7 @@ def way_home() -> Figure:
             ax.plot(r[..., 0], r[..., 2], color=colour, linewidth=width)
         ax.plot(*abort.steps[0].end[:, [0, 2]].T, "o", color=ORANGE, markersize=4)
         ax.plot(*abort.steps[-1].end[:, [0, 2]].T, "o", color=INK, markersize=4)
-        ax.set(xlabel="x [m]", title=abort.way_text)
+        ax.set(xlabel="x [m]", title=abort.home.way)
         ax.set_aspect("equal")
         ax.spines[["top", "right"]].set_visible(False)
     fig.axes[0].set_ylabel("z [m]")

@@ -16,8 +16,8 @@ from PIL import Image
 from scipy.spatial import KDTree
 
 import rigidfleet as rf
-from rigidfleet.plotting.space import camera_axes
 from rigidfleet.plotting.style import FAINT, GREY, INK, agent_colours, apply_style
+from rigidfleet.result.lights import camera_axes
 
 IMAGE = Path(__file__).parent / "images" / "narrow-passage.gif"
 MISSION, END = "narrow-passage", 85.0  # [s]
@@ -58,7 +58,8 @@ class Film:
     """A figure whose moving parts are set for one time after the other."""
 
     def __init__(self, result: rf.Result) -> None:
-        self.result, self.axes3 = result, camera_axes(AZIMUTH, ELEVATION)
+        self.result = result
+        self.axes3 = camera_axes(*np.radians([AZIMUTH, ELEVATION]))
         self.boxes = [o for o in result.mission.obstacles if o.kind == "box"]
         self.colours = agent_colours(result.n_agents)
         self.figure = Figure(figsize=SIZE, dpi=DPI)

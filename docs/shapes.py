@@ -14,9 +14,10 @@ from rigidfleet.formation.shapes import slots
 from rigidfleet.math import pid
 from rigidfleet.math.constraint_jacobian import filter_factors
 from rigidfleet.mission import Mission
-from rigidfleet.plotting import sketches, space
+from rigidfleet.plotting import sketches
 from rigidfleet.plotting.graph import formation_graphs_figure
 from rigidfleet.plotting.style import DASHES, FLOWN, GREY, INK, PALETTE
+from rigidfleet.result.lights import camera_axes
 from rigidfleet.rigidity import Kind, analyse, realisations
 from rigidfleet.rigidity.design import design
 
@@ -83,7 +84,7 @@ def folded_twin() -> Figure:
     found = realisations(cube, edges, starts=200).shapes
     twin = max((r for r in found if r.kind is Kind.FOLDED), key=lambda r: r.closest)
     fig = Figure(figsize=(9.0, 3.4))
-    R = space.camera_axes(-62.0, 18.0)
+    R = camera_axes(*np.radians([-62.0, 18.0]))
     told = f"its folded twin: pairs up to {twin.deviation:.1f} m off"
     for k, (p, name) in enumerate(((cube, "a cube of 18 edges"), (twin.slots, told))):
         ax = fig.add_axes((0.02 + 0.5 * k, 0.02, 0.46, 0.84))

@@ -105,10 +105,10 @@ def flown_apart(seed: int, *, rotors: bool = False) -> float:
             assert np.linalg.norm(r[:, left] - r[:, [lost]], axis=2).min() > 0.3
         return float(np.linalg.norm(r[:, i] - r[:, j], axis=2).min()) - 0.3
 
-    if not abort.way_text:
-        if "'lost agent" in abort.why_no_way:
+    if not abort.home.way:
+        if "'lost agent" in abort.home.reason:
             return np.inf
-        assert "the plan itself" in abort.why_no_way
+        assert "the plan itself" in abort.home.reason
         data = mission.to_dict()
         assert apart(Mission.from_dict(data | {"abort": {}, "disturbances": {}}), 0.0) < 0.3
         return np.inf
@@ -191,7 +191,7 @@ def test_every_second_has_a_way_home_and_no_two_come_nearer(to: str) -> None:
     start = aborts.mission.fleet.position
     i, j = np.triu_indices(len(start), 1)
     for abort in aborts.all_aborts():
-        assert abort.way_text, abort.why_no_way
+        assert abort.home.way, abort.home.reason
         r = abort.positions_at(np.linspace(abort.begins, abort.rest_time, 1500))
         least = float(np.linalg.norm(r[:, i] - r[:, j], axis=2).min()) - 2.0 * 0.15
         proved = abort.certificate.separation
@@ -202,7 +202,7 @@ def test_every_second_has_a_way_home_and_no_two_come_nearer(to: str) -> None:
         last = abort.steps[-1].end
         order = np.linalg.norm(last[:, None, :2] - start[:, :2], axis=2).argmin(axis=1)
         assert sorted(order) == list(range(len(start)))
-        planned = abort.way_text == "lands as planned"
+        planned = abort.home.way == "lands as planned"
         assert to == "any" or planned or (order == np.arange(len(start))).all()
         assert np.allclose(last[:, :2], start[order, :2], atol=0.01)
 
@@ -263,7 +263,7 @@ def test_files_of_vehicles_lead_home_from_every_second(tmp_path: Path, name: str
     back = 0
     for abort, planned in zip(table["aborts"], check.aborts, strict=True):
         if abort["ways"] is None:
-            assert planned.way_text == "lands as planned"
+            assert planned.home.way == "lands as planned"
             continue
         steps = table["ways"][str(abort["ways"])]
         end = abort["stops_s"] + sum(x["duration_s"] for x in steps)
@@ -413,7 +413,7 @@ def test_some_leave_and_the_others_fly_on(agents: list[int], T: float) -> None:
     assert (
         np.linalg.norm(r[:, i] - r[:, j], axis=2).min() - 0.3 >= abort.certificate.separation - 1e-9
     )
-    away = abort.positions_at(np.array([abort.stop_time]))[0] - r[0]
+    away = abort.positions_at(np.array([abort.begins + abort.waits + abort.slows]))[0] - r[0]
     assert all(np.abs(away[k - 1]).max() > 0.01 for k in agents) or T < 10.0
 
 
@@ -479,8 +479,8 @@ def test_what_stands_in_the_way_is_named() -> None:
     data["agents"]["position"] = [[x, y, 12.0] for x, y, _ in data["agents"]["position"]]
     aborts = aborts_of(complete_times(Mission.from_dict(data | legs)))
     abort = aborts.abort_at(2.0)
-    assert not abort.way_text
-    assert "there is no ground to land on" in abort.why_no_way
+    assert not abort.home.way
+    assert "there is no ground to land on" in abort.home.reason
     roof = {
         "name": "roof",
         "kind": "box",
@@ -490,8 +490,8 @@ def test_what_stands_in_the_way_is_named() -> None:
     }
     mission = complete_times(Mission.from_dict(data | {"obstacles": [{"kind": "ground"}, roof]}))
     abort = aborts_of(mission).abort_at(2.0)
-    assert not abort.way_text
-    assert "'roof' stands in the way" in abort.why_no_way
+    assert not abort.home.way
+    assert "'roof' stands in the way" in abort.home.reason
     result = rf.simulate(Mission.from_dict(mission.to_dict() | {"abort": {"at": 2.0}}))
     assert not result.complete
     assert "'roof' stands in the way" in result.ending
@@ -518,7 +518,7 @@ def test_what_flies_past_fast_is_seen_between_slow_samples() -> None:
         far = r - np.column_stack([centre, 0.0 * t + y, 0.0 * t + z])[:, None]
         hit = np.linalg.norm(far, axis=2).min() < 0.6 + 0.15
         hits.add(bool(hit))
-        assert (planned.way_text == abort.way_text) == (not hit)
+        assert (planned.home.way == abort.home.way) == (not hit)
     assert hits == {True, False}
 
 
@@ -545,7 +545,7 @@ def test_ways_home_stay_within_fences() -> None:
         entered.append(0)
         for t in (21.0, 24.0, 28.0):
             abort = aborts.abort_at(t)
-            assert abort.way_text
+            assert abort.home.way
             x, y, z = np.moveaxis(
                 abort.positions_at(np.linspace(abort.begins, abort.rest_time, 3000)), 2, 0
             )
@@ -637,5 +637,5 @@ def test_a_thousand_come_home_from_every_second(to: str) -> None:
         complete_times(Mission.from_dict(mission.to_dict() | {"abort": {"to": to}}))
     )
     assert len(check.aborts) == 81
-    assert all(x.way_text for x in check.aborts)
+    assert all(x.home.way for x in check.aborts)
     assert check.least_separation >= 0.8

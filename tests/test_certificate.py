@@ -148,7 +148,7 @@ def show(n: int = 30, **keys: Any) -> Mission:
 def test_a_certificate_is_the_least_separation_of_ten_thousand_samples():
     """Of each phase of a tour: the value, the pair and the time."""
     for planned in preview_phases(show())[0]:
-        proof = planned.certificate
+        proof = planned.leg.certificate
         assert proof is not None
         assert proof.how == "closed form"
         apart = np.array([pdist(r).min() for r in planned.position]) - 0.2

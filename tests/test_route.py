@@ -222,7 +222,7 @@ def test_a_safe_assignment_is_bounded(monkeypatch):
         assert len(asked) <= 4, "a fifth assignment"
         return np.arange(len(p))
 
-    monkeypatch.setattr(assignment, "_least_squares_assignment", count)
+    monkeypatch.setattr(assignment, "least_squares_assignment", count)
     text = mission_text("show-1000").replace('"each"', '"safe"')
     mission = Mission.from_toml(text)
     assert len(mission.assigned_slots["helix"]) == 1000

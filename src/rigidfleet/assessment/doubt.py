@@ -23,6 +23,7 @@ from rigidfleet._common.text import first_few
 from rigidfleet.assessment.alignment import Alignment
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import CheckResult, Verdict, keeps_limit, value
+from rigidfleet.formation.assignment import least_squares_assignment
 from rigidfleet.math import proximity
 from rigidfleet.math.smoothing import NoiseEstimate
 from rigidfleet.result import Result
@@ -232,8 +233,6 @@ def uncertainty_facts(
         facts["resets_s"] = resets
     if alignment is None:
         return facts
-    from scipy.optimize import linear_sum_assignment
-
     off = np.where(flown.left[..., None], flown.position - flown.slot_position, np.nan)
     mean, far = np.nanmean(off, axis=0), np.nan_to_num(np.linalg.norm(off, axis=2))
     worst, each = far.argmax(axis=0), np.arange(flown.n_agents)
@@ -242,7 +241,7 @@ def uncertainty_facts(
     size = np.linalg.norm(mean, axis=1)
     places = np.nan_to_num([flown.position, flown.slot_position])[:, :: -(-len(off) // _SAMPLES)]
     p, slots = places.swapaxes(1, 2).reshape(2, len(each), -1)
-    order = linear_sum_assignment(-(p @ slots.T))[1]
+    order = least_squares_assignment(p, slots)
     if np.sum((p - slots[order]) ** 2) < _NEARER**2 * np.sum((p - slots) ** 2):
         facts["order"] = (order + 1).tolist()
     aside = size - np.nan_to_num(by) > np.maximum(_OFF, 2.0 * np.median(size) * (len(size) > 1))

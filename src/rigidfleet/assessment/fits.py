@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache
 from itertools import repeat
 from typing import NamedTuple
 
@@ -66,7 +65,7 @@ def formation_fits(
 
     ``greatest_error``: the one that is allowed [m], of the shortest distance of two slots [m].
     """
-    dimension, axis, order, shortest = _shape_properties(slots.tobytes())
+    dimension, axis, order, shortest = _shape_properties(slots)
     own, centred = p - p.mean(axis=1, keepdims=True), rigid_body.centred(slots)
     # The decompositions of the sums of p slot^T over the agents.
     u, s, vt = np.linalg.svd(own.swapaxes(1, 2) @ centred)
@@ -88,16 +87,14 @@ def formation_fits(
         yield Fit(dimension, axis, limit, error, pair, apart, intended, mirrored, place, ordered)
 
 
-@lru_cache(16)
-def _shape_properties(slots: bytes) -> tuple[int, Floats, list[int], float]:
+def _shape_properties(slots: Floats) -> tuple[int, Floats, list[int], float]:
     """Of slots (N, 3): dimension, axis of `Fit`, order on a line, shortest distance [m]."""
-    points = np.frombuffer(slots).reshape(-1, 3)
-    centred = rigid_body.centred(points)
+    centred = rigid_body.centred(slots)
     dimension = distance_geometry.dimension(centred, THIN)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
     axis = axes[0] if dimension == 1 else axes[2]
     order = (centred @ axis).argsort().tolist() if dimension == 1 else []
-    return dimension, axis, order, float(proximity.nearest(points).min())
+    return dimension, axis, order, float(proximity.nearest(slots).min())
 
 
 #: Error of a distance [m], of which two, the distances flown and intended [m].

@@ -62,21 +62,6 @@ class Measurements:
         """Distances to each other and to obstacles at samples."""
         return closeness(self.result)
 
-    @cached_property
-    def samples_by_name(self) -> dict[str, Samples]:
-        """Values at samples of each quantity of which a phase has a worst value."""
-        return {q.name: self.samples_of(q.name) for q in QUANTITIES.values() if q.by_phase}
-
-    @cached_property
-    def phase_ranks(self) -> dict[tuple[str, int], float]:
-        """Greatest rank of each of these quantities at the samples of each phase that has samples."""
-        starts, ranks = np.array([self.parts[k].start for k in self.flown]), {}
-        for name, sampled in self.samples_by_name.items():
-            if places := sampled.rank.shape[1]:
-                most = np.maximum.reduceat(sampled.rank.reshape(-1), places * starts).tolist()
-                ranks |= {(name, k): rank for k, rank in zip(self.flown, most, strict=True)}
-        return ranks
-
     def first_time(self, broken: Bools) -> float:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
         return float(self.result.time[int(np.argmax(broken))]) if broken.any() else math.inf
@@ -137,14 +122,14 @@ class Measurements:
     def worst_by_phase(self) -> list[dict[str, Extreme]]:
         """The worst values of each phase, at its samples or between them, by name."""
         every: list[dict[str, Extreme]] = [{} for _ in self.parts]
-        for name, sampled in self.samples_by_name.items():
-            q, alone = sampled.quantity, name not in self.names_recorded
-            for k, (phase, worst) in enumerate(zip(self.result.phases, every, strict=True)):
-                x, rank = phase.extremes.get(name), self.phase_ranks.get((name, k), -math.inf)
-                if x is not None and rank < q.rank(_in_unit(q, x)):
-                    worst[name] = self.extreme_of(name, x, phase.name)
-                elif e := self.worst_sample(sampled, self.parts[k], alone=alone):
-                    worst[name] = e
+        for q in (q for q in QUANTITIES.values() if q.by_phase):
+            sampled, alone = self.samples_of(q.name), q.name not in self.names_recorded
+            for phase, part, worst in zip(self.result.phases, self.parts, every, strict=True):
+                x, e = phase.extremes.get(q.name), self.worst_sample(sampled, part, alone=alone)
+                if x is not None and (e is None or q.rank(e.value) < q.rank(_in_unit(q, x))):
+                    e = self.extreme_of(q.name, x, phase.name)
+                if e is not None:
+                    worst[q.name] = e
         return every
 
     def first_contact(self, name: str, e: Extreme) -> Extreme | None:
@@ -228,27 +213,28 @@ class Measurements:
                     words = f"it lacks the worst '{name}' of phase '{phase.name}' between samples"
                     yield words, float(time[part.start])
             for name, share in _SLACK.items():
-                x, rank = extremes.get(name), self.phase_ranks.get((name, index), -math.inf)
-                if x is None or rank == -math.inf:
+                x, e = extremes.get(name), self.worst_sample(self.samples_of(name), part)
+                if x is None or e is None:
                     continue
+                rank, recorded = map(quantity(name).rank, (e.value, x.value))
                 slack = rounding + share * abs(rank)
-                if rank > self.samples_by_name[name].quantity.rank(x.value) + slack or not (
+                if rank > recorded + slack or not (
                     phase.t_start - 1e-9 <= x.time <= phase.t_end + 1e-9
                 ):
-                    sampled = self.worst_sample(self.samples_by_name[name], part)
-                    assert sampled is not None
                     words = (
                         f"its worst {name.replace('_', ' ')} of phase '{phase.name}' is given as"
                     )
-                    words += f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(sampled.value)}"
-                    yield words, sampled.when
+                    words += (
+                        f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(e.value)}"
+                    )
+                    yield words, e.when
 
     def needs_extreme(self, name: str, index: int) -> bool:
         """Whether a phase that has samples has a worst value of a quantity between them."""
         if name == "geofence":
             return self.mission.limits.geofence is not None
         if name != "clearance":
-            return self.phase_ranks.get((name, index), -math.inf) > -math.inf
+            return self.worst_sample(self.samples_of(name), self.parts[index]) is not None
         # An obstacle that is there at the start or the end of a phase alone is not in it.
         phase = self.result.phases[index]
         there = (thing.solid.there[0] for thing in self.mission.obstacles)
@@ -261,7 +247,7 @@ class Measurements:
         return PhaseVerdict(
             **{key: getattr(record, key) for key in _OF_RECORD},
             finished=finished and not record.abandoned,
-            constraint=self.constraint_errors_at_end.get(index),
+            constraint=_greatest_size(result.constraint[self.parts[index]][-1:]),
             distances=self.shape_errors_and_fits[0].get(index),
             shape=None if fit is None else fit.error,
             handedness=None if fit is None or fit.dimension < 3 else not fit.is_mirrored,
@@ -280,11 +266,6 @@ class Measurements:
         """The last sample of each phase flown."""
         return [self.parts[k].stop - 1 for k in self.flown]
 
-    @cached_property
-    def constraint_errors_at_end(self) -> dict[int, float | None]:
-        """Greatest constraint error [m] of an edge at the end of each phase flown."""
-        return dict(zip(self.flown, _row_maxima(self.result.constraint[self.last]), strict=True))
-
     def edges_at_sample(self, formation: str, k: int) -> tuple[Ints, Floats]:
         """Edges (m, 2) of a formation that are not lost at sample k, and their lengths (m,) [m]."""
         mission = self.mission
@@ -296,24 +277,17 @@ class Measurements:
     @cached_property
     def shape_errors_and_fits(self) -> tuple[dict[int, float | None], dict[int, Fit]]:
         """Greatest errors [m] of edges against the formation at the end of each phase that has one, and its fits."""
-        result, mission, errors, fits, groups = self.result, self.mission, {}, {}, {}
-        links = (mission.links_lost[1] < result.time[self.last, None]).sum(axis=1).tolist()
-        whole = np.isfinite(result.position[self.last].sum(axis=(1, 2))).tolist()
-        for index, k, *state in zip(self.flown, self.last, links, whole, strict=True):
-            if (name := result.phases[index].formation) is not None:
-                # Ends of one formation are measured together, while nobody and no link is lost.
-                groups.setdefault((name, self.left[k].tobytes(), *state), []).append((index, k))
-        for (name, *_, finite), ends in groups.items():
-            phases, samples = zip(*ends, strict=True)
-            r, left = result.position[[*samples]], np.flatnonzero(self.left[samples[0]])
-            edges, intended = self.edges_at_sample(name, samples[0])
-            off = proximity.pair_distances(r, edges).T - intended
-            errors.update(zip(phases, _row_maxima(off), strict=True))
+        result, mission, errors, fits = self.result, self.mission, {}, {}
+        for index, k in zip(self.flown, self.last, strict=True):
+            if (name := result.phases[index].formation) is None:
+                continue
+            r, left = result.position[[k]], np.flatnonzero(self.left[k])
+            edges, intended = self.edges_at_sample(name, k)
+            errors[index] = _greatest_size(proximity.pair_distances(r, edges)[:, 0] - intended)
             slots = mission.formation_slots(name)
-            if slots is not None and len(left) > 1 and finite:
+            if slots is not None and len(left) > 1 and np.isfinite(r).all():
                 most = mission.formations[name].greatest_error
-                every = formation_fits(r[:, left], slots[left], left, most)
-                fits.update(zip(phases, every, strict=True))
+                (fits[index],) = formation_fits(r[:, left], slots[left], left, most)
         return errors, fits
 
     @property
@@ -324,20 +298,19 @@ class Measurements:
     @cached_property
     def axis_errors_at_end(self) -> dict[int, float | None]:
         """Angle [deg] of a line or plane from its intended direction at the end of each phase that has one."""
-        flat = {index: fit for index, fit in self.fits_at_end.items() if fit.dimension < 3}
-        if not flat:
-            return {}
-        samples = [self.parts[k].stop - 1 for k in flat]
-        axes, flips = np.array([fit.axis for fit in flat.values()]), {}
-        # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
-        wanted = (
-            np.einsum("kij,ki->kj", att.dcm_from_quaternion(q[samples]), axes).tolist()
-            for q in (self.result.attitude_reference, self.result.frame)
-        )
-        for index, fit, *ways in zip(flat, flat.values(), *wanted, strict=True):
+        flips, result = {}, self.result
+        for index, fit in self.fits_at_end.items():
+            if fit.dimension == 3:
+                continue
             # Only tracked slots steer a line; otherwise its direction follows from the shape before.
-            steers = 2 if fit.dimension == 2 else self.result.phases[index].control == "tracking"
-            angles = (angle_between(fit.turned_axis, aim) for aim in ways[:steers])
+            steers = 2 if fit.dimension == 2 else result.phases[index].control == "tracking"
+            k = self.parts[index].stop - 1
+            # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
+            aims = (
+                fit.axis @ att.dcm_from_quaternion(q[k])
+                for q in (result.attitude_reference, result.frame)[:steers]
+            )
+            angles = (angle_between(fit.turned_axis, aim.tolist()) for aim in aims)
             flips[index] = next(filter(math.isfinite, angles), None)
         return flips
 
@@ -391,7 +364,6 @@ def _in_unit(q: Quantity, x: Extremum) -> float:
     return abs(x.value) if q.name == "constraint" else q.scale * x.value
 
 
-def _row_maxima(values: Floats) -> list[float | None]:
-    """Greatest finite size in each row of values (K, m); None if there is none."""
-    sizes = np.where(np.isfinite(values), np.abs(values), -1.0).max(axis=1, initial=-1.0)
-    return [None if size < 0.0 else size for size in sizes.tolist()]
+def _greatest_size(values: Floats) -> float | None:
+    """Greatest finite size of some values; None if there is none."""
+    return max(np.abs(values[np.isfinite(values)]).tolist(), default=None)

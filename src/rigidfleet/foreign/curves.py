@@ -129,13 +129,12 @@ def least_jerk_curve(curve: Piecewise) -> Piecewise:
 
     time, x = curve.time, curve.at(curve.time)
     x[:, 3] = np.unwrap(x[:, 3])
-    zero = np.zeros(1)
-    natural = [(3, zero), (4, zero)]
+    known = CHANNELS if np.isfinite(x[:, 3]).all() else 3
+    natural = [(3, np.zeros(known)), (4, np.zeros(known))]
+    spline = make_interp_spline(time, x[:, :known], k=5, bc_type=(natural, natural))
     pieces = np.full((len(time) - 1, CHANNELS, 6), np.nan)
-    for q in range(CHANNELS if np.isfinite(x[:, 3]).all() else 3):
-        spline = make_interp_spline(time, x[:, q : q + 1], k=5, bc_type=(natural, natural))
-        at = [spline(time[:-1], nu=k)[:, 0] / math.factorial(k) for k in range(6)]
-        pieces[:, q] = np.stack(at, axis=-1)
+    for k in range(6):
+        pieces[:, :known, k] = spline(time[:-1], nu=k) / math.factorial(k)
     return Piecewise(time, pieces)
 
 

@@ -22,7 +22,7 @@ from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign import logs, poses, shows, texts
 from rigidfleet.foreign.columns import Units, parse_units
 from rigidfleet.foreign.curves import ASSUMED, Trajectories
-from rigidfleet.math.piecewise import Piecewise
+from rigidfleet.math.piecewise import Piecewise, concatenate_curves
 
 __all__ = ["Gaps", "Interpolation", "Spans", "Trajectories", "read_trajectories"]
 
@@ -315,10 +315,7 @@ def _read_sequence(group: list[Path], *options: Any) -> Trajectories:
     if {part.assumed for part in parts} != {texts.POLYNOMIALS}:
         why = "only tables of polynomials follow each other"
         raise _error(group[0], why, "Give a folder with one table a vehicle")
-    curve, *more = (part.curves[0] for part in parts)
-    for after in more:
-        time = np.concatenate([curve.time, after.time[1:] + curve.time[-1]])
-        curve = Piecewise(time, np.concatenate([curve.pieces, after.pieces]))
+    curve = concatenate_curves([part.curves[0] for part in parts])
     return parts[0]._replace(names=(group[0].parent.name,), curves=(curve,))
 
 

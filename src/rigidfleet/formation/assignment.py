@@ -125,13 +125,13 @@ def assign_slots(
         if turn is None or radius is not None:
             raise ValueError("a metric needs a prescribed turn, and no radius")
         fixed, M = (np.asarray(x, dtype=np.float64) for x in (turn, metric))
-        return AssignedSlots(_least_squares_assignment(p @ M, q @ fixed.T @ M), fixed)
+        return AssignedSlots(least_squares_assignment(p @ M, q @ fixed.T @ M), fixed)
     own_order, scale = np.arange(n), float((p**2).sum() + (q**2).sum())
     fits = AssignedSlots(own_order, kabsch(p, q))
     options = [fits]
     if turn is not None:
         fixed = np.asarray(turn, dtype=np.float64)
-        short = AssignedSlots(_least_squares_assignment(p, q @ fixed.T), fixed)
+        short = AssignedSlots(least_squares_assignment(p, q @ fixed.T), fixed)
         options = [short, AssignedSlots(own_order, fixed)] + ([] if radius is None else [fits])
     if turn is None or radius is not None:
         left = max(1, int(_WORK / n**3))
@@ -179,8 +179,8 @@ _LEAST = 1024
 _FEW = 100
 
 
-def _least_squares_assignment(p: Floats, q: Floats) -> Ints:
-    """Order (N,) of slots q (N, 3) in which no two agents p (N, 3) reduce the sum of squares by an exchange.
+def least_squares_assignment(p: Floats, q: Floats) -> Ints:
+    """Order (N,) of slots q (N, Q) in which no two agents p (N, Q) reduce the sum of squares by an exchange.
 
     For up to `_LEAST` agents the sum is the least of all orders.
     """
@@ -275,10 +275,10 @@ def _assign_and_turn(p: Floats, q: Floats, turn: Floats, most: int) -> tuple[Ass
 
     Each step reduces the same sum of squares; the last is an assignment. Also return their number, at most ``most``.
     """
-    order = _least_squares_assignment(p, q @ turn.T)
+    order = least_squares_assignment(p, q @ turn.T)
     for used in range(1, most):
         turned = kabsch(p, q[order])
-        new = _least_squares_assignment(p, q @ turned.T)
+        new = least_squares_assignment(p, q @ turned.T)
         if (new == order).all():
             return AssignedSlots(order, turned), used + 1
         order, turn = new, turned

@@ -18,7 +18,7 @@ import numpy as np
 from rigidfleet.foreign.curves import with_headings
 from rigidfleet.interchange.curves import ExportedMotion, cubic_curves, heading_knots
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.result.lights import angles_facing_formation, has_lights, light_colours, light_fades
+from rigidfleet.result import lights
 from rigidfleet.typing import Floats, Ints
 
 _FLOAT, _UNSIGNED = 5126, 5125
@@ -93,7 +93,7 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
         "bufferViews": file.views,
         "accessors": file.accessors,
     }
-    if has_lights(motion.result):
+    if lights.has_lights(motion.result):
         _add_lights(scene, file, motion)
     scene["buffers"] = [{"byteLength": len(file.data)}]
     words = json.dumps(scene).encode()
@@ -111,9 +111,9 @@ def _add_lights(scene: dict[str, Any], file: _File, motion: ExportedMotion) -> N
     """
     result, animation, n = motion.result, scene["animations"][0], motion.n_agents
     # A change at once takes a millisecond. Samplers are linear where they do not say.
-    ends = [t for fade in light_fades(result) for t in (fade.begin, fade.end + 1e-3)]
+    ends = [t for fade in lights.light_fades(result) for t in (fade.begin, fade.end + 1e-3)]
     times = np.unique(np.clip(ends, motion.start, motion.end).round(4))
-    shown = light_colours(result, times)
+    shown = lights.light_colours(result, times)
     shown = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)  # linear
     last = len(times) - 1 - shown[::-1].any(axis=2).argmax(axis=0)
     scene["extensionsUsed"] = [_POINTER]
@@ -129,13 +129,10 @@ def _add_lights(scene: dict[str, Any], file: _File, motion: ExportedMotion) -> N
         pointer = {_POINTER: {"pointer": f"/materials/{i}/emissiveFactor"}}
         target = {"path": "pointer", "extensions": pointer}
         animation["channels"].append({"sampler": len(animation["samplers"]) - 1, "target": target})
-    azimuth, elevation = angles_facing_formation(result)
     low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
     far = float(np.linalg.norm(high - low)) / 2 / np.sin(_FOV / 2)
-    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    ahead = np.array([right[1], -right[0], 0.0])
-    back = np.cos(elevation) * ahead + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
-    axes = np.stack([right, np.cross(back, right), back, (low + high) / 2 + far * back])
+    right, up, back = lights.camera_axes(*lights.angles_facing_formation(result))
+    axes = np.stack([right, up, back, (low + high) / 2 + far * back])
     matrix = np.column_stack([_z_up_to_y_up(axes), [0.0, 0.0, 0.0, 1.0]]).ravel().tolist()
     seen = {"yfov": _FOV, "znear": 0.01 * far, "zfar": 10 * far}
     scene["cameras"] = [{"type": "perspective", "perspective": seen}]

@@ -220,6 +220,15 @@ def join_curves(curves: Sequence[Piecewise], most: float = np.inf) -> Piecewise:
     return Piecewise(knots, np.moveaxis(rows, 0, -1))
 
 
+def concatenate_curves(curves: Sequence[Piecewise]) -> Piecewise:
+    """Curves that begin at 0 [s], one after the other."""
+    ends = np.cumsum([0.0, *(float(curve.time[-1]) for curve in curves)])
+    times = [curve.time[1:] + t for curve, t in zip(curves, ends, strict=False)]
+    powers = max(curve.pieces.shape[-1] for curve in curves)
+    pieces = [pad(curve.pieces, powers) for curve in curves]
+    return Piecewise(np.concatenate([[0.0], *times]), np.concatenate(pieces))
+
+
 def pad(pieces: Floats, powers: int) -> Floats:
     """Pieces (..., P) with zeros up to so many powers."""
     lacking = powers - pieces.shape[-1]

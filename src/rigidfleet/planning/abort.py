@@ -27,7 +27,7 @@ from rigidfleet.foreign.curves import curve_to_rows
 from rigidfleet.formation.assignment import assign_slots, downwash_metric, pairs_nearer_than
 from rigidfleet.kernel.problem import septic_polynomial
 from rigidfleet.math import falls, proximity
-from rigidfleet.math.piecewise import Piecewise, common_knots, pad, refine_knots
+from rigidfleet.math.piecewise import Piecewise, common_knots, concatenate_curves, refine_knots
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.boundaries import Boundaries, BoundaryWatch, Worst, boundary_in_words
 from rigidfleet.mission.kinds import Follow, Land
@@ -100,7 +100,7 @@ class Step(NamedTuple):
     Attributes
     ----------
     name : what it is called
-    make : makes its `way_text`: so many ways of so many vehicles are not kept
+    make : makes its `way`: so many ways of so many vehicles are not kept
     duration : how long it takes [s]
     end : positions (N, 3) [m] at its end
     least : separation that is proved, its time from the beginning
@@ -153,21 +153,6 @@ class Abort:
     slows: float = 0.0
 
     @property
-    def way_text(self) -> str:
-        """How the vehicles go home; "" if no way is proved."""
-        return self.home.way
-
-    @property
-    def why_no_way(self) -> str:
-        """Why there is no way that is proved; "" if there is one."""
-        return self.home.reason
-
-    @property
-    def stop_time(self) -> float:
-        """When those that go home have stopped on the plan [s]."""
-        return self.begins + self.waits + self.slows
-
-    @property
     def rest_time(self) -> float:
         """When all vehicles rest [s]."""
         return self.begins + sum(step.duration for step in self.steps)
@@ -184,17 +169,9 @@ class Abort:
 
     def positions_at(self, time: Floats) -> Floats:
         """Positions (K, N, 3) [m] at mission times (K,) [s] from `begins` on; at rest after the last step."""
-        return _concatenate_curves([step.way for step in self.steps]).at(
+        return concatenate_curves([step.way for step in self.steps]).at(
             np.minimum(time, self.rest_time) - self.begins
         )
-
-
-def _concatenate_curves(curves: Sequence[Piecewise]) -> Piecewise:
-    """Curves from 0 [s], one after the other, with 8 powers."""
-    ends = np.cumsum([0.0, *(float(x.time[-1]) for x in curves)])
-    times = [x.time[1:] + t for x, t in zip(curves, ends, strict=False)]
-    pieces = [pad(x.pieces, 8) for x in curves]
-    return Piecewise(np.concatenate([[0.0], *times]), np.concatenate(pieces))
 
 
 def _rest_to_rest(start: Floats, end: Floats, time: float) -> Piecewise:
@@ -649,18 +626,15 @@ class Aborts:
 
     def _abort_of_leavers(self, ordered: float) -> Abort:
         """Some vehicles go home, as soon as they come near no other one; the others fly the plan on."""
-        begins, end, who = (
-            ordered + self.options.reaction,
-            self.plan_end,
-            self._aborts_of_leavers.left,
-        )
+        begins, end = ordered + self.options.reaction, self.plan_end
+        who = self._aborts_of_leavers.left
         order = np.concatenate([who, np.setdiff1d(self.left, who)])
         problem = "there is no time left"
         plan = self.step_by_clock("", _path_clock(begins, max(end - begins, SHORTEST), _ON)).least
         for waits in np.arange(0.0, end - begins, self.options.step).tolist():
             alone = self._aborts_of_leavers._abort_of_all(ordered + waits)
-            if alone.why_no_way:
-                problem = alone.why_no_way
+            if alone.home.reason:
+                problem = alone.home.reason
                 continue
             make = partial(self._all_ways, begins, waits, alone.steps)
             way = make()
@@ -684,9 +658,9 @@ class Aborts:
         ways = [Piecewise.hermite(last, states).shift_time(-last[0])]
         if last[0] > begins:
             ways.insert(0, self.plan.between(begins, last[0]).shift_time(-begins))
-        on = _concatenate_curves(ways)
+        on = concatenate_curves(ways)
         before = [on.between(0.0, waits)] if waits else []
-        own = _concatenate_curves([*before, *(step.way for step in steps)])
+        own = concatenate_curves([*before, *(step.way for step in steps)])
         knots, who = common_knots([own, on]), self._aborts_of_leavers.left
         own, way = (x.refine(knots, stays=True) for x in (own, on))
         way.pieces[:, who] = own.pieces[:, who]

@@ -84,10 +84,8 @@ class Detour:
         # The rotation vector from Q, whose rates are those of the body as long as it is small
         spin = derivatives_at(np.array([np.zeros(3), *self.omega]), accelerations[3:6])
         Q = att.dcm_from_rotation_vector(spin[0]).T @ self.Q
-        x, scale = (
-            derivatives_at(self.x, accelerations[:3]),
-            derivatives_at(self.scale, accelerations[6]),
-        )
+        x = derivatives_at(self.x, accelerations[:3])
+        scale = derivatives_at(self.scale, accelerations[6])
         return Detour(x, Q, spin[1:], scale)
 
     def taylor_series(self) -> tuple[Floats, Floats, Floats]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -15,8 +14,6 @@ from rigidfleet.mission import Phase
 from rigidfleet.planning.derivatives import reference_of_agents
 from rigidfleet.typing import Bools, Floats
 
-#: Greatest size of slots, in bytes, whose least separation is cached.
-_KEPT = 100_000
 #: What a certificate of bent ways gives away, so that its search ends [m].
 CLOSE = 1e-6
 #: Shares of a blend's duration, and of the paths flown by then.
@@ -44,7 +41,7 @@ class Certificate(NamedTuple):
 
 
 def certificate_of(
-    phase: Phase, reference: Reference, radius: Floats, lost: Bools | None = None
+    phase: Phase, reference: Reference, radius: Floats, lost: Bools
 ) -> Certificate | None:
     """Certificate of a phase whose agents track slots; None if they do not, if slots jump, or for a single agent.
 
@@ -56,7 +53,7 @@ def certificate_of(
 
 
 def certificate_in_step(
-    start: Floats, end: Floats, duration: float, radius: Floats, lost: Bools | None = None
+    start: Floats, end: Floats, duration: float, radius: Floats, lost: Bools
 ) -> Certificate | None:
     """Certificate of straight septic blends (N, 3) [m] in step from 0 on [s]; the rest as `certificate_of`."""
     none, ways = np.zeros(0), end - start
@@ -64,48 +61,33 @@ def certificate_in_step(
     return _prove_some(reference, radius, lost)
 
 
-def _prove_some(reference: Reference, radius: Floats, lost: Bools | None) -> Certificate | None:
+def _prove_some(reference: Reference, radius: Floats, lost: Bools) -> Certificate | None:
     """Certificate of the slots of vehicles that are not ``lost`` (N,)."""
-    left = None if lost is None else np.flatnonzero(~lost)
-    if left is not None:
-        reference, radius = reference_of_agents(reference, left), radius[left]
-    if len(radius) < 2:
+    left = np.flatnonzero(~lost)
+    if len(left) < 2:
         return None
-    some = reference
+    some, radius = reference_of_agents(reference, left), radius[left]
     certificate = (
         prove_ways(some.knots, some.ways, radius) if len(some.knots) else prove_blend(some, radius)
     )
-    if certificate is None or left is None:
-        return certificate
     i, j = (int(left[k]) for k in certificate.agents)
     return certificate._replace(agents=(i, j))
 
 
-def prove_blend(reference: Reference, radius: Floats) -> Certificate | None:
-    """Certificate of slots that blend: relative to the virtual body, all move straight and in step.
+def prove_blend(reference: Reference, radius: Floats) -> Certificate:
+    """Certificate of slots of two agents or more that blend: relative to the virtual body, all move in step.
 
-    How the virtual body moves and turns meanwhile does not matter to distances. None for a single agent.
+    How the virtual body moves and turns meanwhile does not matter to distances.
     """
-    p, dp = reference.p0, reference.dp
-    if len(p) < 2:
-        return None
-    least = _closest_of_blend if p.nbytes < _KEPT else _closest_of_blend.__wrapped__
-    separation, pair, share = least(p.tobytes(), dp.tobytes(), radius.tobytes())
-    time = reference.t0
+    p, dp, time = reference.p0, reference.dp, reference.t0
+    if dp.any():
+        separation, pair, share = closest_approach(p, p + dp, radius)
+    else:
+        (separation,), ((i, j),) = (x.tolist() for x in proximity.separation(p[None], radius))
+        pair, share = (i, j), 0.0
     if share > 0.0:
         time += reference.T_b * float(np.interp(share, _FLOWN, _TAU))
     return Certificate(separation, time, pair, "closed form")
-
-
-@lru_cache(64)
-def _closest_of_blend(p: bytes, dp: bytes, radius: bytes) -> tuple[float, tuple[int, int], float]:
-    """`closest_approach` of slots that blend or stay, cached because most phases have the slots of the one before."""
-    start, ways = (np.frombuffer(x).reshape(-1, 3) for x in (p, dp))
-    r = np.frombuffer(radius)
-    if ways.any():
-        return closest_approach(start, start + ways, r)
-    least, pairs = proximity.separation(start[None], r)
-    return float(least[0]), (int(pairs[0, 0]), int(pairs[0, 1])), 0.0
 
 
 def prove_ways(

@@ -278,7 +278,7 @@ def climb_heights(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     else:
         up = ground.max() + phase.arrival_height - place
     goes = np.isin(np.arange(n), phase.movers(n))
-    return np.where(goes if now.lost is None else goes & ~now.lost, up, 0.0)
+    return np.where(goes & ~now.lost, up, 0.0)
 
 
 def _surface_heights_below(mission: Mission, now: PhaseState) -> Floats:
@@ -292,21 +292,19 @@ def _surface_heights_below(mission: Mission, now: PhaseState) -> Floats:
     _, goal, slots = now.pose_goal_slots
     r = goal.r + slots @ goal.T
     heights = mission.height_at(*r.T)
-    flying = np.ones(len(r), dtype=np.bool_) if now.lost is None else ~now.lost
-    if len(off := np.flatnonzero(flying & ~np.isfinite(heights))):
+    if len(off := np.flatnonzero(~now.lost & ~np.isfinite(heights))):
         x, y, _ = r[off[0]]
         problem = f"needs a ground, and none is below agent {off[0] + 1} at ({x:.1f}, {y:.1f}) m"
         remedy = "add [[obstacles]] with kind = 'ground', or more terrain"
         raise MissionError([Finding(mission.origin, "phases", None, problem, remedy)])
-    return np.where(flying, heights, heights[flying].min())
+    return np.where(now.lost, heights[~now.lost].min(), heights)
 
 
 def height_above_landing(mission: Mission, now: PhaseState) -> float:
     """How far [m] the lowest vehicle is above the height at which a landing ends, at the pose to hold."""
     _, goal, slots = now.pose_goal_slots
-    left = np.ones(mission.n_agents, dtype=np.bool_) if now.lost is None else ~now.lost
     below = goal.r[2] + slots @ goal.T[:, 2] - mission.fleet.radius
-    return float(below[left].min() - _surface_heights_below(mission, now).min()) - ABOVE
+    return float(below[~now.lost].min() - _surface_heights_below(mission, now).min()) - ABOVE
 
 
 def _course_to(

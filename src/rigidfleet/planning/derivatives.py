@@ -57,8 +57,6 @@ def slot_derivatives(
 
 def reference_of_agents(reference: Reference, who: Ints) -> Reference:
     """The reference of some agents' slots."""
-    if len(who) == len(reference.p0):
-        return reference
     ways = reference.ways[:, who] if len(reference.knots) else reference.ways
     return reference._replace(p0=reference.p0[who], dp=reference.dp[who], ways=ways)
 

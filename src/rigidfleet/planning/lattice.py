@@ -158,11 +158,8 @@ class Lattice:
         self.room = space.room_at(self.points[:, None] + layer.offsets, radius, need).min(axis=1)
         free = self.room >= need
         index = np.arange(len(grid)).reshape(self.shape)
-        tails, heads = [], []
-        for k in range(3):
-            tails.append(np.delete(index, -1, axis=k).ravel())
-            heads.append(np.delete(index, 0, axis=k).ravel())
-        self.all_edges = np.array([np.concatenate(tails), np.concatenate(heads)])
+        ends = ([np.delete(index, end, axis=k).ravel() for k in range(3)] for end in (-1, 0))
+        self.all_edges = np.array([np.concatenate(nodes) for nodes in ends])
         edges = self.all_edges[:, free[self.all_edges].all(axis=0)]
         still = np.zeros(len(radius))
         a, b = self.points[edges[0]], self.points[edges[1]]
@@ -341,11 +338,8 @@ class Roadmap:
                         stops[first:after] = moved
                         break
             first = after
-        alike = [
-            k > 0 and s[1] == stops[k - 1][1] and np.array_equal(s[0], stops[k - 1][0])
-            for k, s in enumerate(stops)
-        ]
-        return [s for s, again in zip(stops, alike, strict=True) if not again]
+        further = (b for a, b in pairwise(stops) if a[1] != b[1] or not np.array_equal(a[0], b[0]))
+        return [stops[0], *further]
 
     def _motion_clearances(self) -> Iterator[tuple[Ints, Ints, Floats]]:
         """Nodes of the world's lattice that a motion or a change joins, proved or not, and the room there [m]."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -105,18 +106,13 @@ def layer_changes(
     """Turns and changes of shape, each between two layers; layers are all angles of the first shape, and so on."""
     count = len(angles)
     for s, shape in enumerate(shapes):
-        for i in range(count):
-            for j in range(i + 1, count):
-                if angle_between_attitudes(angles[i], angles[j]) < _HALF:
-                    yield Change(
-                        s * count + i, s * count + j, *_turn_path(shape.slots, angles[i], angles[j])
-                    )
-    for s, one in enumerate(shapes):
-        for t in range(s + 1, len(shapes)):
-            for i in range(count):
-                folding = _shape_change_path(mission, one, shapes[t], angles[i])
-                if folding is not None:
-                    yield Change(s * count + i, t * count + i, *folding)
+        for (i, a), (j, b) in combinations(enumerate(angles), 2):
+            if angle_between_attitudes(a, b) < _HALF:
+                yield Change(s * count + i, s * count + j, *_turn_path(shape.slots, a, b))
+    for (s, one), (t, two) in combinations(enumerate(shapes), 2):
+        for i, a in enumerate(angles):
+            if (folding := _shape_change_path(mission, one, two, a)) is not None:
+                yield Change(s * count + i, t * count + i, *folding)
 
 
 def _turn_path(slots: Floats, before: Angles, after: Angles) -> tuple[Path, Floats]:

@@ -210,9 +210,7 @@ def leg_of(mission: Mission, phase: Phase, now: PhaseState) -> Leg:
 
 def depart(mission: Mission, phase: Phase, now: PhaseState) -> Departure:
     """Attach the body frame to a state, and find what the phase blends from there."""
-    left, shaping = mission.fleet.mass, phase.shaping
-    if now.lost is not None:
-        left = np.where(now.lost, 0.0, left)
+    left, shaping = np.where(now.lost, 0.0, mission.fleet.mass), phase.shaping
     target = mission.slots_about_cm(now.formation if shaping is None else shaping.formation)
     turn = None
     if shaping is not None:
@@ -266,7 +264,7 @@ def _attach_frame(
         pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
         if now.v.any():
             pose.omega = T @ mean_axis_rates(x[None], about_cm(now.v, masses)[None], masses)[0]
-        if now.lost is not None and fit is not None:
+        if now.lost.any() and fit is not None:
             centre = masses @ fit / masses.sum()  # of the remaining agents, from the body's origin
             pose.r = pose.r - T.T @ centre
             pose.v = pose.v - T.T @ np.cross(pose.omega, centre)

@@ -107,7 +107,7 @@ def use_of_limits(
     time = _grid_times(reference, motion, begin, end)
     n = len(reference.p0)
     step = max(1, _BLOCK // len(time))
-    best: list[Reached | None] = [None] * len(limits)
+    best: dict[int, Reached] = {}
     for first in range(0, n, step):
         who = np.arange(first, min(first + step, n))
         x = slot_derivatives(reference_of_agents(reference, who), motion, time, 4)
@@ -115,10 +115,9 @@ def use_of_limits(
             if not np.isfinite(limit.most[who]).any():
                 continue
             highest = _greatest_share(limit, reference, motion, time, x, who, fine=fine)
-            before = best[k]
-            if before is None or highest.share > before.share:
+            if k not in best or highest.share > best[k].share:
                 best[k] = highest
-    return [highest for highest in best if highest is not None]
+    return [best[k] for k in sorted(best)]
 
 
 def _grid_times(reference: Reference, motion: Motion, begin: float, end: float) -> Floats:

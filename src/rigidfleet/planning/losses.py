@@ -84,8 +84,8 @@ def answer_to_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequenc
     legs = plan()
     abort = Aborts(mission, legs, now.lost).abort_at(now.t - mission.aborting.reaction)
     phases, least = phases_of(mission, abort.steps, "abort: "), abort.certificate.separation
-    promise = least if abort.way_text and math.isfinite(least) else None
-    return Answer(legs_from(mission, state_to_leave(legs, now), phases), abort.why_no_way, promise)
+    promise = least if abort.home.way and math.isfinite(least) else None
+    return Answer(legs_from(mission, state_to_leave(legs, now), phases), abort.home.reason, promise)
 
 
 def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg]]) -> list[Leg]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,6 @@ from rigidfleet.kernel.problem import (
     Disturbance,
     External,
     Feedback,
-    Graph,
     Motion,
     Problem,
     Reference,
@@ -256,7 +255,7 @@ def plan_phase(
             masses, 1.0 / masses, float(masses.sum()), float(masses.mean()), mission.fleet.thrust_limit.copy(),
             mission.agents.saturate, mission.gravity,
         ),
-        graph=_constraint_graph(edges.tobytes(), masses.tobytes(), large=method != "dense"),
+        graph=graph(edges, masses, large=method != "dense"),
         law=_constraint_law(
             mission,
             mission.damping(held, now.lost),
@@ -280,11 +279,9 @@ def plan_phase(
         loses=min(mission.first_loss, mission.abandons_at) < math.inf,
         through=points_passed(phase.points, motion),
     )  # fmt: skip
-    if now.lost is not None or len(plan.links_lost[1]):
-        lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
-        parted = plan.links_lost[1] <= now.t
-        if lost.any() or parted.any():
-            plan.remove_lost_edges(lost, parted)
+    parted = plan.links_lost[1] <= now.t
+    if now.lost.any() or parted.any():
+        plan.remove_lost_edges(now.lost, parted)
     return plan
 
 
@@ -323,20 +320,12 @@ def _refuse_hopeless_phase(mission: Mission, phase: Phase, start: float, edges: 
         )
 
 
-@lru_cache(64)
-def _constraint_graph(edges: bytes, masses: bytes, *, large: bool) -> Graph:
-    """The constraint graph, cached because most phases have the same one as the phase before."""
-    pairs = np.frombuffer(edges, dtype=np.int64).reshape(-1, 2).copy()
-    return graph(pairs, np.frombuffer(masses), large=large)
-
-
 def _name_if_in_formation(mission: Mission, name: str | None, now: PhaseState) -> str | None:
     """The formation, if the remaining agents are in it: all pairs within a tenth of the shortest distance."""
     slots = mission.formation_slots(name) if name else None
     if slots is None:
         return None
-    left = slice(None) if now.lost is None else ~now.lost
-    slots, r = slots[left], now.r[left]
+    slots, r = slots[~now.lost], now.r[~now.lost]
     if len(slots) < 2:
         return None
     pairs = graphs.complete_graph(len(slots))

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigidfleet.mission import Mission
-from rigidfleet.planning.certificate import Certificate
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg, leg_of, state_at_start
 from rigidfleet.typing import Floats
@@ -42,7 +41,6 @@ class PlannedPhase:
     leg : from which the paths are computed
     path_ends : if the shape changes, the agents' positions (N, 3) [m] before and after it, about the centre, in a frame
         that turns with them; in this frame all agents move straight and in step
-    shapes : names of the formations before (None if there is none) and after
     """
 
     phase: str
@@ -53,12 +51,6 @@ class PlannedPhase:
     exact: bool
     leg: Leg
     path_ends: tuple[Floats, Floats] | None = None
-    shapes: tuple[str | None, str | None] = (None, None)
-
-    @property
-    def certificate(self) -> Certificate | None:
-        """The least separation of the planned paths, proved; None if agents track no slots."""
-        return self.leg.certificate
 
 
 def preview_phases(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPhase], bool]:
@@ -87,8 +79,7 @@ def planned_phase(leg: Leg, most: int) -> PlannedPhase:
     states = slot_derivatives(reference, motion, time, 3).swapaxes(0, 1)
     straight = leg.phase.shaping is not None and not len(reference.knots)
     ways = (reference.p0, reference.p0 + reference.dp) if straight else None
-    shapes = leg.before.formation, leg.formation
-    return PlannedPhase(leg.phase.name, time, *states, leg.follows_exactly, leg, ways, shapes)
+    return PlannedPhase(leg.phase.name, time, *states, leg.follows_exactly, leg, ways)
 
 
 def samples_per_phase(mission: Mission) -> int:

@@ -110,11 +110,14 @@ class PhaseState:
     slots: Floats | None = None  # (N, 3) last commanded, about the CM, body axes [m]
     pose: Pose | None = None  # last commanded; None if there was no command
     goal: Pose | None = None  # the pose to hold
-    lost: Bools | None = None  # (N,) lost vehicles; None if there are none
+    lost: Bools = field(init=False)  # (N,) lost vehicles; none at first
     blend: Reference | None = None  # change of shape under way, if a loss has ended its phase
     # Velocity, acceleration, jerk (3, N, 3) of the slots about the CM, body axes, if an abort has ended a phase, or
     # files have ended in motion.
     rates: Floats | None = None
+
+    def __post_init__(self) -> None:
+        self.lost = np.zeros(len(self.r), dtype=np.bool_)
 
     @property
     def pose_goal_slots(self) -> tuple[Pose, Pose, Floats]:

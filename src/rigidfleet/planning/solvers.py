@@ -7,7 +7,6 @@ agents suffice (`rigidfleet.kernel.elimination`). Other large systems are solved
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -52,12 +51,6 @@ def elimination_steps(n: int, edges: Ints) -> Ints | None:
     """
     if n < 3 or len(edges) != 3 * n - 6:
         return None
-    return _cached_elimination_steps(n, np.ascontiguousarray(edges, dtype=np.int64).tobytes())
-
-
-@lru_cache(maxsize=4)
-def _cached_elimination_steps(n: int, data: bytes) -> Ints | None:
-    edges = np.frombuffer(data, dtype=np.int64).reshape(-1, 2)
     later = edges.max(axis=1)
     if (np.bincount(later, minlength=n) == np.minimum(np.arange(n), 3)).all():
         # In the agents' own order, so that neighbours in the sequence are neighbours in memory.

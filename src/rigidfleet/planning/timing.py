@@ -131,7 +131,8 @@ def timed_leg(
     phase = _with_point_times(mission, phase, departure)
     shortest, vary = _SHORTEST, partial(_with_travel, phase)
     if phase.duration == AUTO and phase.shaping is not None and phase.shaping.blend != AUTO:
-        shortest, vary = phase.shaping.least_time, partial(_with_duration, phase)
+        shortest = phase.shaping.least_time
+        vary = lambda t: phase.model_copy(update={"duration": t})  # noqa: E731
     time, worst = _min_time(mission, vary, departure, shortest)
     if time is None:
         problem = f"no time keeps the limits of the mission: {reached_in_words(worst, phase)}"
@@ -231,11 +232,6 @@ def _with_travel(phase: Phase, time: float) -> Phase:
             at.model_copy(update={"time": (at.time or 0.0) * time / before}) for at in phase.points
         )
     return phase.model_copy(update=times)
-
-
-def _with_duration(phase: Phase, time: float) -> Phase:
-    """A phase that lasts a time [s], whatever the duration of its blend."""
-    return phase.model_copy(update={"duration": time})
 
 
 #: Time of a way [s] for which the times of its points are allocated, before the least one is known.

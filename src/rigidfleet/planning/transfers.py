@@ -27,6 +27,8 @@ from rigidfleet.typing import Floats
 #: Spans of a way between its knots; samples of each span at which distances are penalised, or so many that the longest
 #: way has this many in the distance to keep, on average.
 _SPANS, _SAMPLES, _PASSED = 16, 3, 2.0
+#: Share of the way at each control point: the first and last three are equal, for rest at the ends.
+_SHARE = np.clip((np.arange(_SPANS + 3) - 2) / (_SPANS - 2), 0.0, 1.0)[:, None, None]
 #: Durations tried, as multiples of the slowest single vehicle's, and random starts of each, before one roundabout.
 _SLOWER, _STARTS = (1.5, 1.8, 2.1, 2.4), 2
 #: Weights of distances, speed, acceleration and box; of smoothness. Distances are wanted this much larger.
@@ -113,7 +115,7 @@ def plan_transfer(
     least_time = max(least_duration(s, g, limits.speed, limits.acceleration), _SHORTEST)
     for duration in (slower * least_time for slower in _SLOWER):
         for start_number in range(_STARTS + 2):
-            control = _straight_control_points(s, g)
+            control = (1 - _SHARE) * s + _SHARE * g  # straight ways
             if start_number > _STARTS:  # as in a roundabout, for crowds that all meet at one place
                 control = _descend(_right_hand_control_points(s, g), duration, limits, rng)
             elif start_number:  # straight ways will not do
@@ -147,21 +149,14 @@ def _b_spline_weights(u: Floats, spans: int) -> Floats:
     return B
 
 
-def _straight_control_points(s: Floats, g: Floats) -> Floats:
-    """Control points (M + 3, N, 3) of straight ways. The first and last three are equal, for rest at the ends."""
-    share = np.clip((np.arange(_SPANS + 3) - 2) / (_SPANS - 2), 0.0, 1.0)[:, None, None]
-    return (1 - share) * s + share * g
-
-
 def _right_hand_control_points(s: Floats, g: Floats) -> Floats:
     """Control points (M + 3, N, 3) of ways that all keep to the right, seen from above on half an ellipse.
 
     Where each vehicle goes to the opposite place of a circle, this is half a turn of them all.
     """
-    share = np.clip((np.arange(_SPANS + 3) - 2) / (_SPANS - 2), 0.0, 1.0)[:, None, None]
     way = g - s
     right = 0.5 * np.stack([way[:, 1], -way[:, 0], 0.0 * way[:, 0]], axis=1)
-    return s + 0.5 * (1.0 - np.cos(np.pi * share)) * way + np.sin(np.pi * share) * right
+    return s + 0.5 * (1.0 - np.cos(np.pi * _SHARE)) * way + np.sin(np.pi * _SHARE) * right
 
 
 def _descend(control: Floats, duration: float, limits: _Limits, rng: np.random.Generator) -> Floats:

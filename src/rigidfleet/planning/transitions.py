@@ -123,10 +123,8 @@ def _expand_stagger(
     travel = round(phase.duration - (len(groups) - 1) * phase.stagger, 6)
     if not 0.0 < travel <= phase.stagger + 1e-6:
         what = f"leaves {travel:g} s to each of" if travel > 0 else "is too short for"
-        problem, whole = (
-            f"{what} {len(groups)} groups, {phase.stagger:g} s apart",
-            len(groups) * phase.stagger,
-        )
+        problem = f"{what} {len(groups)} groups, {phase.stagger:g} s apart"
+        whole = len(groups) * phase.stagger
         remedy = f"groups go one after another: give a duration of {whole:g} s, or up to {phase.stagger:g} s less"
         raise error_of_key(mission, number, "duration", phase.duration, problem, remedy)
     common = {key: x for key, x in table.items() if key not in ("stagger", "by")}
@@ -193,13 +191,10 @@ def _airspace(mission: Mission, now: PhaseState | None) -> Floats:
     if now is None or (pose := now.goal) is None:
         return box
     radius, fence = float(mission.fleet.radius.max()), mission.limits.geofence
-    lowest = np.array([-np.inf, -np.inf, mission.ground + radius])
-    within = np.array([lowest, [np.inf] * 3])
+    low, high = np.array([-np.inf, -np.inf, mission.ground + radius]), np.full(3, np.inf)
     if fence is not None:
-        within = np.array(
-            [np.maximum(lowest, np.array(fence.min) + radius), np.array(fence.max) - radius]
-        )
-    within -= pose.r
+        low, high = np.maximum(low, np.array(fence.min) + radius), np.array(fence.max) - radius
+    within = np.array([low, high]) - pose.r
     for q in range(3):  # axis q of the body along an axis of the world
         k = int(np.abs(pose.T[q]).argmax())
         if abs(pose.T[q, k]) > 1.0 - 1e-9:

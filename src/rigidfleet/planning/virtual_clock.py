@@ -101,12 +101,9 @@ class VirtualClock:
 def delay_by(problem: Problem, delay: float) -> Problem:
     """A problem whose references come later by a delay [s]."""
     reference, motion = problem.reference, problem.motion
-    if delay == 0.0:
-        return problem
-    knots = reference.knots + delay if len(reference.knots) else reference.knots
     return problem._replace(
         motion=motion._replace(knots=motion.knots + delay),
-        reference=reference._replace(t0=reference.t0 + delay, knots=knots),
+        reference=reference._replace(t0=reference.t0 + delay, knots=reference.knots + delay),
     )
 
 

@@ -104,13 +104,9 @@ class _Search:
     def _near_obstacles(self) -> list[Any]:
         """Obstacles at rest that may stand in the way."""
         low, high = self._search_box
-        return [
-            thing
-            for thing in self.mission.obstacles
-            if not thing.solid.moves
-            and (swept_extent(thing.solid)[0] <= high + self.reach + 1.0).all()
-            and (swept_extent(thing.solid)[1] >= low - self.reach - 1.0).all()
-        ]
+        low, high = low - self.reach - 1.0, high + self.reach + 1.0
+        still = ((x, *swept_extent(x.solid)) for x in self.mission.obstacles if not x.solid.moves)
+        return [x for x, a, b in still if (a <= high).all() and (b >= low).all()]
 
     @property
     def _search_box(self) -> Floats:

@@ -51,15 +51,10 @@ class OffPlan(NamedTuple):
         """From what to what (2, K, N) [m] the distances are."""
         return np.stack([np.maximum(self.far - self.doubt, 0.0), self.far + self.doubt])
 
-    @property
-    def is_beyond_limit(self) -> Bools:
-        """Who is surely beyond the limit (K, N)."""
-        return self.distance_interval[0] > self.limit
-
     def drift_spans(self, time: Floats) -> list[Drift]:
         """Each time in which a vehicle is off, those of one after the other."""
         drifts = []
-        for i, off in enumerate(self.is_beyond_limit.T):
+        for i, off in enumerate((self.distance_interval[0] > self.limit).T):
             k = np.flatnonzero(off)
             again = (np.diff(k) > 1) & (np.diff(time[k]) >= _SOON)
             for part in np.split(k, np.flatnonzero(again) + 1)[: len(k)]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,10 +25,9 @@ _TEXT_ROW = 0.35  # height of a row that holds only text
 
 def rotor_limits(mission: Mission) -> Floats:
     """Maximum thrust (N,) of a rotor of each vehicle [N]; NaN for points, which have none."""
-    models = mission.vehicle_models
-    if models is None:
-        return np.full(mission.n_agents, np.nan)
-    return np.array([math.nan if model.point else model.rotor_limit for model in models])
+    limits = np.zeros(mission.n_agents)
+    limits[:] = QUANTITIES["rotor_force"].limit_of(mission) or 0.0
+    return np.where(limits > 0.0, limits, np.nan)
 
 
 def has_rotors(result: Result) -> bool:
@@ -70,10 +68,8 @@ def rotors(result: Result) -> Figure:
 def _draw_greatest_rotor(ax: Axes, result: Result) -> None:
     """The greatest of the four rotors of each vehicle, as a share of its limit."""
     limits = rotor_limits(result.mission)
-    share, between = (
-        100.0 * rotor_forces(result).max(axis=2) / limits,
-        _rotor_nearest_to_limit(result, limits),
-    )
+    share = 100.0 * rotor_forces(result).max(axis=2) / limits
+    between = _rotor_nearest_to_limit(result, limits)
     if between is not None:
         between = between._replace(value=100.0 * between.value / limits[between.who], other=-1)
     ax.set_ylabel("share of the rotor limit [%]")

@@ -11,9 +11,9 @@ import numpy as np
 from rigidfleet.formation import distance_geometry
 from rigidfleet.plotting import curves
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.space import camera_axes
 from rigidfleet.result import Result
-from rigidfleet.result.lights import plane_view
+from rigidfleet.result.lights import camera_axes, plane_view
+from rigidfleet.solids.distance import vector_from_segment
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -116,9 +116,9 @@ def draw_formation_sketch(
     flat = thin and distance_geometry.dimension(p, 1e-3) < 3
     turn, lit = np.eye(3), mission.formation_colours(name)
     if lit:
-        turn = camera_axes(*np.degrees(plane_view(p)))
+        turn = camera_axes(*plane_view(p))
     elif sideways or not flat:
-        turn = camera_axes(-70.0, 30.0 if flat else 16.0)
+        turn = camera_axes(*np.radians([-70.0, 30.0 if flat else 16.0]))
     words += "" if placed else "; their distances fix no positions"
     ax.set_title(st.clean_name(name), pad=22, fontsize=9, fontweight="bold", parse_math=False)
     at: dict[str, Any] = {"transform": ax.transAxes, "ha": "center", "parse_math": False}
@@ -161,7 +161,8 @@ def draw_graph(
         middle = a + (b - a) * (0.5 if np.hypot(*(a + b)[:2]) > 0.3 * room else 0.28)
         others = np.delete(p, [i, j], axis=0)
         path = np.array([a, b])[:, :2]
-        if len(others) and _distances_to_segment(others, a, b).min() < 0.02 * room:
+        beside = np.linalg.norm(vector_from_segment(*others.T, a, b), axis=0)
+        if beside.min(initial=room) < 0.02 * room:
             # A straight edge would run through another agent.
             across = np.array([a[1] - b[1], b[0] - a[0]]) * -0.22
             s = np.linspace(0, 1, 40)[:, None]
@@ -227,10 +228,3 @@ def _draw_body_axes(ax: Axes, axes: Floats, length: float) -> None:
         arrow = {"arrowstyle": "-|>", "color": st.INK, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 0}
         ax.annotate("", (x, y), (0, 0), zorder=4, arrowprops=arrow)
         ax.annotate(label, (1.1 * x, 1.1 * y), **look)
-
-
-def _distances_to_segment(points: Floats, a: Floats, b: Floats) -> Floats:
-    """Distances of points (n, 3) from the segment a b."""
-    along = b - a
-    s = np.clip((points - a) @ along / max(float(along @ along), 1e-300), 0.0, 1.0)
-    return np.linalg.norm(points - a - s[:, None] * along, axis=1)

@@ -149,10 +149,6 @@ def draw_obstacle_from_above(ax: Axes, shape: DrawnObstacle) -> None:
         low_to_high = LinearSegmentedColormap.from_list("terrain", ["#F4F1EA", COLOUR])
         ax.contourf(x, y, z.T, 8, cmap=low_to_high, alpha=0.5, zorder=0.8)
         ax.contour(x, y, z.T, 8, colors=colour, linewidths=0.4, alpha=0.8, zorder=0.9)
-    low, high = points.min(axis=0), points.max(axis=0)
-    corner = Path(
-        [low, [high[0], low[1]], high]
-    )  # of a terrain, which has its contours: it is as wide
     # A terrain has its contours: a corner of it shows how wide it is.
     low, high = points.min(axis=0), points.max(axis=0)
     corner = Path([low, [high[0], low[1]], high])

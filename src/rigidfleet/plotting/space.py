@@ -92,10 +92,8 @@ def _waypoints(result: Result) -> list[tuple[str, Floats]]:
 
 def _waypoint_names_by_place(view: Scene, axes: int) -> list[tuple[str, Floats]]:
     """Names of the waypoints, of those joined that are at one place as it is seen in 2 or 3 axes."""
-    near, joined = (
-        _ONE_PLACE * np.linalg.norm(view.high - view.low),
-        list[tuple[list[str], Floats]](),
-    )
+    near = _ONE_PLACE * np.linalg.norm(view.high - view.low)
+    joined: list[tuple[list[str], Floats]] = []
     for name, place in view.waypoints:
         there = (names for names, at in joined if np.linalg.norm((at - place)[:axes]) < near)
         if (names := next(there, None)) is None:
@@ -339,11 +337,3 @@ def trajectory(result: Result) -> Figure:
         handles=entries, loc="lower center", ncols=columns, borderaxespad=0.8, columnspacing=1.4
     )
     return fig
-
-
-def camera_axes(azimuth: float, elevation: float) -> Floats:
-    """Unit vectors right, up and towards the viewer (rows) of a camera at these angles [deg]."""
-    a, e = math.radians(azimuth), math.radians(elevation)
-    out = np.array([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)])
-    right = np.array([-math.sin(a), math.cos(a), 0.0])
-    return np.array([right, np.cross(out, right), out])

@@ -40,13 +40,13 @@ class AbortsCheck(Shown):
     @property
     def least_separation(self) -> float:
         """The least separation that all ways home promise [m]."""
-        return min((x.certificate.separation for x in self.aborts if x.way_text), default=np.inf)
+        return min((x.certificate.separation for x in self.aborts if x.home.way), default=np.inf)
 
     def facts(self) -> Sheet:
         """Runs of orders with the same answer, each with its worst numbers."""
         options, name, all_ = self.mission.aborting, self.mission.name, len(self.aborts)
         heads = ("ordered [s]", "way home", "takes [s]", "least [m]", "one that does not hear")
-        ways = sum(bool(x.way_text) for x in self.aborts)
+        ways = sum(bool(x.home.way) for x in self.aborts)
         text = f"{name}: a way home from {ways} of {all_} times, {options.step:g} s apart"
         if np.isfinite(self.least_separation):
             text += f"; no two vehicles come nearer than {self.least_separation:.2f} m"
@@ -60,20 +60,20 @@ class AbortsCheck(Shown):
     def _rows_of_runs(self) -> Iterator[Row]:
         both = zip(self.aborts, self.unheard, strict=True)
         for _, group in itertools.groupby(
-            both, lambda x: re.sub(r"[\d.]+", "#", x[0].way_text or x[0].why_no_way)
+            both, lambda x: re.sub(r"[\d.]+", "#", x[0].home.way or x[0].home.reason)
         ):
             run = list(group)
             aborts = [abort for abort, _ in run]
             first, last = aborts[0].ordered, aborts[-1].ordered
             when = f"{first:g}" if first == last else f"{first:g} to {last:g}"
-            if not aborts[0].way_text:
-                yield Row((when, f"none: {aborts[0].why_no_way}", None, None, ""), "note")
+            if not aborts[0].home.way:
+                yield Row((when, f"none: {aborts[0].home.reason}", None, None, ""), "note")
                 continue
             takes = max(x.rest_time - x.ordered for x in aborts)
             least = min(x.certificate.separation for x in aborts)
             worst = min((each for _, each in run if each), key=min, default=[])
             apart = least if np.isfinite(least) else None
-            yield Row((when, aborts[0].way_text, takes, apart, self._unheard_in_words(worst)))
+            yield Row((when, aborts[0].home.way, takes, apart, self._unheard_in_words(worst)))
 
     def _unheard_in_words(self, each: list[Worst]) -> str:
         """What follows if a vehicle does not hear, in words."""
@@ -97,8 +97,9 @@ class AbortsCheck(Shown):
             "to": options.to, "reaction_s": options.reaction, "step_s": options.step,
             "aborts": [
                 {
-                    "ordered_s": x.ordered, "begins_s": x.begins, "waits_s": x.waits, "stops_s": x.stop_time,
-                    "ends_s": x.rest_time, "way": x.way_text, "reason": x.why_no_way, "ways": x.home.number,
+                    "ordered_s": x.ordered, "begins_s": x.begins, "waits_s": x.waits,
+                    "stops_s": x.begins + x.waits + x.slows, "ends_s": x.rest_time,
+                    "way": x.home.way, "reason": x.home.reason, "ways": x.home.number,
                     "separation": _pair_data(x.certificate.separation, x.certificate.time, *x.certificate.agents),
                     "unheard": _pair_data(*min(each)) if each else None, "endangered": self._count_in_danger(each),
                 }

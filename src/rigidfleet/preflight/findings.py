@@ -465,7 +465,7 @@ class Preflight(Shown):
         """What is said in words, each with its heading."""
         if self.is_show:
             yield from ((f.name, words) for f in self.formations if (words := _scene_words(f)))
-        lacking = [p.phase for p in self.planned_phases if p.certificate is None]
+        lacking = [p.phase for p in self.planned_phases if p.leg.certificate is None]
         if lacking and self.certificates:
             yield "not proved", f"{names_in_words(lacking)} flown without tracked slots"
         guessed = [planned.phase for planned in self.planned_phases if not planned.exact]
@@ -477,7 +477,7 @@ class Preflight(Shown):
     @property
     def certificates(self) -> dict[str, Certificate]:
         """Certificate of each planned phase that has one, by its name."""
-        each = ((planned.phase, planned.certificate) for planned in self.planned_phases)
+        each = ((planned.phase, planned.leg.certificate) for planned in self.planned_phases)
         return {name: certificate for name, certificate in each if certificate is not None}
 
     def data(self) -> dict[str, Any]:

@@ -79,7 +79,7 @@ def planned_answer_to_loss(mission: Mission, at: Leg, legs: Sequence[Leg]) -> An
     """What follows the first loss, or an order to abort, in the leg ``at`` of the planned ones."""
     when = mission.abandons_at
     lost = mission.lost_at <= when
-    now = copy_with(at.state_at(when), lost=lost if lost.any() else None)
+    now = copy_with(at.state_at(when), lost=lost)
     return answer_to_loss(mission, now, lambda: legs)
 
 

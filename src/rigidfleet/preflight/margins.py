@@ -91,7 +91,7 @@ def formation_closed_loops(
     work, skipped = 0, False
     pairs = list(zip(mission.phases, way, strict=False))
     for phase, planned in sorted(pairs, key=lambda pair: _changes_shape(pair[1])):  # ways come last
-        name = planned.shapes[1]
+        name = planned.leg.formation
         if name is None or not len(edges := mission.formation_edges(name)):
             continue
         law = phase_gains(mission, phase, None if _changes_shape(planned) else name)
@@ -126,11 +126,12 @@ def phase_gains(mission: Mission, phase: Phase | None, held: str | None) -> Loop
 
 
 def _changes_shape(planned: PlannedPhase) -> bool:
-    return planned.path_ends is not None and planned.shapes[0] != planned.shapes[1]
+    leg = planned.leg
+    return planned.path_ends is not None and leg.before.formation != leg.formation
 
 
 def _place_in_words(planned: PlannedPhase) -> str:
-    before, after = planned.shapes
+    before, after = planned.leg.before.formation, planned.leg.formation
     if not _changes_shape(planned):
         return f"'{after}'"
     return f"on the way to '{after}'" if before is None else f"'{before}' to '{after}'"

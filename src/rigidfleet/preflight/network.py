@@ -89,7 +89,7 @@ def linear_flights(
     drag = np.array([model.linear_drag for model in mission.vehicle_models])
     drag /= mission.fleet.mass[:, None]
     pairs = zip(mission.phases, way, strict=False)
-    laws = {(planned.shapes[1], phase_gains(mission, p, planned.shapes[1])) for p, planned in pairs}
+    laws = {(x.leg.formation, phase_gains(mission, p, x.leg.formation)) for p, x in pairs}
     for name, law in sorted(laws, key=str):
         slots = None if name is None else mission.formation_slots(name)
         if name is None or slots is None:
@@ -262,7 +262,7 @@ def growth_in_network(flight: LinearFlight, net: Links, every: int) -> Floats:
 def network_remarks(preflight: Preflight) -> Iterator[Remark]:
     """Remarks on formations whose network is beyond what they bear, or was not checked."""
     mission, planned = preflight.mission, preflight.planned_phases
-    for name in dict.fromkeys(name for p in planned if (name := p.shapes[1]) is not None):
+    for name in dict.fromkeys(name for p in planned if (name := p.leg.formation) is not None):
         unchecked = mission.network is not None and name not in preflight.network
         if unchecked and len(mission.formation_edges(name)):
             text = f"'{name}': not checked over its network: it has no slots, no edge in range, or too many edges"

@@ -147,7 +147,7 @@ def _broken_limits_in_words(
     if not phase.lands:  # that ends where vehicles stand
         remarks += obstacle_remarks(mission, there)
     broken = {remark.topic: remark.text for remark in remarks if remark.level == "fails"}
-    proved, least = planned.certificate, there.separation
+    proved, least = leg.certificate, there.separation
     if proved is not None and least is not None:
         nearer = proved.separation - least[0]
         if nearer > limits.separation_allowance:

@@ -50,11 +50,10 @@ def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         for k in [int(separations.argmin())] if planned.path_ends is None else [0, -1]:
             ends.append((float(separations[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
         bent = len(planned.leg.reference.knots) and planned.path_ends is None and flying.all()
-        if bent and (proved := planned.certificate) is not None:
+        if bent and (proved := planned.leg.certificate) is not None:
             ends = [proved[:3]]
         if planned.path_ends is not None:
-            certificate = planned.certificate or prove_blend(planned.leg.reference, radius)
-            assert certificate is not None  # there are two agents
+            certificate = planned.leg.certificate or prove_blend(planned.leg.reference, radius)
             crossing, separation = certificate[:3], certificate.separation
             least = min(least, crossing)
             beyond = flying.all() and (separation <= 0 or separation < limit - SLACK)
@@ -92,7 +91,7 @@ def _collision_remark(
 
 def _crossing_remark(mission: Mission, planned: PlannedPhase, at: _Nearest) -> Remark:
     """Remark on agents whose straight paths from one formation to the next come too close."""
-    (separation, _, who), (before, after) = at, planned.shapes
+    (separation, _, who), before, after = at, planned.leg.before.formation, planned.leg.formation
     radii = sum(mission.agents.radius[i] for i in who)
     needed = radii + (mission.limits.separation or 0.0)
     origin = "the start" if before is None else f"'{before}'"

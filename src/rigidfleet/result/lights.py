@@ -109,6 +109,13 @@ def plane_view(points: Floats, front: Floats | tuple[float, ...] = _FRONT) -> tu
     return float(np.arctan2(y, x)), _LOW
 
 
+def camera_axes(azimuth: float, elevation: float) -> Floats:
+    """Unit vectors right, up and towards the viewer (rows) of a camera at these angles [rad]."""
+    (cos, level), (sin, up) = (f([azimuth, elevation]) for f in (np.cos, np.sin))
+    out, right = np.array([cos * level, sin * level, up]), np.array([-sin, cos, 0.0])
+    return np.array([right, np.cross(out, right), out])
+
+
 def _principal_axes(points: Floats) -> tuple[Floats, Floats]:
     """Extents (3,) of points (n, 3) along their principal directions, the greatest first, and these (3, 3) as rows."""
     about = np.concatenate([points - points.mean(axis=0), np.zeros((3, 3))])

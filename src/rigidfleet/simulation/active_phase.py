@@ -77,9 +77,7 @@ class ActivePhase:
         self.index, self.plan = index, plan
         self.extremes, self.external, self.sampler = extremes, external, sampler
         self.pieces, self.pause, self.workspaces = pieces, pause, workspaces
-        self.lost = np.zeros(len(plan.masses), dtype=np.bool_)
-        if plan.before.lost is not None:
-            self.lost = plan.before.lost
+        self.lost = plan.before.lost
         self.parted = plan.links_lost[1] <= plan.start  # (L,) links that are lost
         self.next_loss = self._next_loss()  # of a vehicle or a link [s]
         self.control_calls = 0  # number of calls of the user's controller

@@ -288,11 +288,10 @@ class Sweep:
     @cached_property
     def columns(self) -> list[SweepColumn]:
         """All numbers that vary, in order."""
-        return [SweepColumn(v, keys) for v in self.variations for keys in self._keys_like(v.path)]
-
-    def _keys_like(self, path: str) -> list[Keys]:
-        """Keys of all places that match a path; a case of a drill is none of the mission."""
-        return [tuple(path.split("."))] if self.drill else keypaths.expand_path(self.whole, path)
+        if self.drill:  # whose cases are none of the mission
+            return [SweepColumn(v, tuple(v.path.split("."))) for v in self.variations]
+        places = ((v, keypaths.expand_path(self.whole, v.path)) for v in self.variations)
+        return [SweepColumn(v, keys) for v, there in places for keys in there]
 
     @cached_property
     def grid_sizes(self) -> dict[str | int, int]:

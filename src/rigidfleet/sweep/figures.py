@@ -366,15 +366,13 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
     fig.colorbar(image, ax=ax, label=unit, pad=0.02)
     ax.grid(visible=False)
     ax.set(xlabel=_axis_label(table, over[0]), ylabel=_axis_label(table, over[1]))
-    for axis, scale, name in zip(
-        (ax.xaxis, ax.yaxis), (ax.set_xscale, ax.set_yscale), over, strict=True
-    ):
+    for axis, key, name in zip((ax.xaxis, ax.yaxis), ("xscale", "yscale"), over, strict=True):
         distinct = np.unique(numbers[name])
         if len(distinct) <= _VALUES:
             every = 1 + (len(distinct) > _LABELS)
             axis.set_ticks(range(0, len(distinct), every), [f"{v:.3g}" for v in distinct[::every]])
         elif _scale_of_variation(table, name) == "log":
-            scale("log")
+            ax.set(**{key: "log"})
             _log_ticks(axis, distinct)
     return fig
 

@@ -60,8 +60,7 @@ def expand_path(whole: Mapping[str, Any], path: str) -> list[Keys]:
 
 def whole_document(mission: Mission) -> dict[str, Any]:
     """A mission as plain data with all defaults; None for optional keys without a value."""
-    whole: dict[str, Any] = _with_defaults(mission, mission.n_agents)
-    return whole
+    return _with_defaults(mission, mission.n_agents)
 
 
 def replace_value(

@@ -209,7 +209,11 @@ def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any,
     ResultError
         The folder does not contain a sweep.
     """
-    with _open_to_read(folder) as db:
+    path = folder / FILE
+    if not path.is_file():
+        raise ResultError(f"{folder}: contains no sweep. `rigidfleet sweep` creates one.")
+    with _as_result_errors(path), closing(sqlite3.connect(path)) as db:
+        _check_format(db, folder)
         entries = dict(db.execute("SELECT key, value FROM sweep"))
         sweep = Sweep.from_json(entries["sweep"])
         shards = int(entries.get("shard", "").partition("/")[2] or 1)
@@ -218,16 +222,6 @@ def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any,
         names = ", ".join(f'"{name}"' if name in known else "NULL" for name in _COLUMNS)
         rows = db.execute(f"SELECT {names} FROM runs ORDER BY run").fetchall()
         return sweep, json.loads(entries["identity"]) | common, rows
-
-
-@contextmanager
-def _open_to_read(folder: Path) -> Generator[sqlite3.Connection]:
-    path = folder / FILE
-    if not path.is_file():
-        raise ResultError(f"{folder}: contains no sweep. `rigidfleet sweep` creates one.")
-    with _as_result_errors(path), closing(sqlite3.connect(path)) as db:
-        _check_format(db, folder)
-        yield db
 
 
 def _check_format(db: sqlite3.Connection, folder: Path) -> None:
