@@ -231,6 +231,16 @@ def test_newton_holds_in_the_record():
     )
 
 
+@pytest.mark.parametrize("lost", [[], [{"agent": 2, "time": 3.5}]])
+def test_each_step_of_vehicles_counts_once(lost):
+    """A flight has as many steps as fit into it, whatever its phases and losses, with four evaluations each."""
+    mission = short(disturbances={"lost": lost})
+    result = rf.simulate(mission)
+    steps = round(float(result.time[-1]) / sampled_flight(mission).h)
+    assert result.statistics["steps"] == steps
+    assert result.statistics["evaluations"] == 4 * steps
+
+
 def test_a_lost_vehicle_falls_and_the_others_fly_on():
     """Without thrust a vehicle falls; the rest of the formation keeps its shape."""
     result = rf.simulate(

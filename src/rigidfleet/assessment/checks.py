@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, quantity
+from rigidfleet._common.quantities import MOTIONS, PLACES, QUANTITIES, Quantity, quantity
 from rigidfleet._common.text import agent_names, percent_text
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.assessment.avoidance import guard_checks
@@ -212,7 +212,7 @@ def _check_at_end(
 
 
 def _waypoint_checks(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
-    """How far each waypoint is missed, in each quantity."""
+    """How far each waypoint is missed, in each quantity, or the one missed the most if all are met."""
     points = [
         (p, what, at)
         for p in phases
@@ -224,9 +224,9 @@ def _waypoint_checks(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
         if at is not None
     ]
     for name, limit in WAYPOINT_TOLERANCE.items():
-        for p, what, at in points:
-            if (miss := getattr(at, name)) is None:
-                continue
+        every = [(x, p, what, at) for p, what, at in points if (x := getattr(at, name)) is not None]
+        failed = [miss for miss in every if not miss[0] <= limit]
+        for miss, p, what, at in failed or sorted(every, key=lambda miss: -miss[0])[:1]:
             unit, passed = UNITS[name], miss <= limit
             words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
             words = f"{what} of phase '{p.name}' is {words} (limit {limit:g} {unit})"
@@ -414,7 +414,8 @@ def _geofence_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
 
 def _boundary_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """The fence that a vehicle comes nearest to or crosses farthest, and the fall that ends nearest to people."""
-    if (e := measured.worst(q.name)) is not None:
+    there = getattr(measured.mission, PLACES[q.who])
+    if there and (e := measured.worst(q.name)) is not None:
         from rigidfleet.mission.boundaries import boundary_in_words  # takes long to load
 
         limit, (agent, place) = q.limit_of(measured.mission), e.who.split(", ", 1)

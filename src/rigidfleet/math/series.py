@@ -102,7 +102,7 @@ def rotation_vector_series(R: Floats) -> Floats:
     """
     phi = np.zeros(R.shape[:-1])
     phi[0] = att.rotation_vector_from_dcm(np.swapaxes(R[0], -1, -2))
-    for k in range(1, len(R)):
+    for k in range(1, len(R) if R[1:].any() else 1):  # most bodies do not turn
         lacking = R[k] - rotation_series(phi[: k + 1])[k] if k > 1 else R[k]  # nothing moves yet
         phi[k] = att.rotation_vector_rate(phi[0], _axial(np.swapaxes(R[0], -1, -2) @ lacking))
     return phi

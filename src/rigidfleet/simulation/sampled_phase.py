@@ -168,6 +168,7 @@ class SampledPhase(ActivePhase):
             self.gone = self.lost.copy()  # (N,) vehicles that do not fly in this phase
             begun.peak_time[:] = begun.worst_time[:] = t
         self.tabled = None
+        self.steps_taken_over = int(begun.count[fleet.STEPS])  # those of the flight before
 
     # -- flying -----------------------------------------------------------------------------------
 
@@ -402,8 +403,10 @@ class SampledPhase(ActivePhase):
         if plan.frame is not None:
             y[6 * n + m : 6 * n + m + 4] = sampled.frame[0]
         state.clock[records.TIME] = sampled.clock[fleet.TIME]
-        state.count[records.EVALUATIONS] = 4 * sampled.count[fleet.STEPS]
-        state.count[records.ACCEPTED] = sampled.count[fleet.STEPS]
+        steps = int(sampled.count[fleet.STEPS]) - self.steps_taken_over
+        state.count[records.EVALUATIONS] += 4 * steps
+        state.count[records.ACCEPTED] += steps
+        self.steps_taken_over += steps
 
     def end(self) -> PhaseState:
         """End the phase; the vehicles keep their states, and so the workspace, to which these may refer."""
