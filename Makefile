@@ -1,6 +1,7 @@
 # Set-up needs Python >= 3.11 with venv and pip; everything else goes into .venv.
 PYTHON ?= python3
-# Tests run on this many processes; MARK selects them (pytest -m), empty for all.
+# Tests run on this many processes; MARK selects them (pytest -m), empty for all. Each process takes a part in order, so
+# that what the tests of a file share is made once; one that has none left takes some of another's.
 JOBS ?= 2
 MARK ?= not long
 
@@ -24,7 +25,7 @@ demo: .venv/.core  ## Fly the paper's narrow passage
 	@$(BIN)/rigidfleet run narrow-passage --force --replay
 
 test: .venv/.dev  ## Run the tests (MARK= runs the long ones, too)
-	@$(BIN)/python -m pytest -n $(JOBS) -m "$(MARK)"
+	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "$(MARK)"
 
 versions: .venv/.uv  ## Fly with the lowest versions and the newest, on every Python found
 	@$(BIN)/python tests/versions.py

@@ -7,6 +7,9 @@ import pytest
 from hypothesis import settings
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+# As in the command: matrices are small, and where each of several processes of tests has several threads, these take up
+# to twenty times the processor time by waiting for each other. To be set before NumPy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Compiling takes longer than any deadline; a red test is to be red for everybody.
 settings.register_profile("rigidfleet", deadline=None, derandomize=True, database=None)

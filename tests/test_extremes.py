@@ -108,7 +108,8 @@ def agrees(mission: Mission, result: Result, steps: Steps, spacing: float) -> in
     """Assert that extremes are those of finely sampled steps; how many flights of these two touch something."""
     times, r = steps.positions(result.n_agents, spacing)
     (phase,) = result.phases
-    for name, values in sampled(mission, r).items():
+    samples = sampled(mission, r)
+    for name, values in samples.items():
         k = int(values.argmin())
         sign = -1.0 if name in ("geofence", "highest") else 1.0
         if not np.isfinite(values[k]):
@@ -128,7 +129,7 @@ def agrees(mission: Mission, result: Result, steps: Steps, spacing: float) -> in
     failed = {f.check for f in verdict.checks if not f.passed}
     touched = 0
     for name in ("separation", "clearance"):
-        least = sampled(mission, r)[name].min()
+        least = samples[name].min()
         if abs(least) > CLOSE:
             assert (name in failed) == (least < 0), (name, least, verdict.summary)
             touched += least < 0

@@ -413,9 +413,11 @@ def test_tables_fit_eighty_columns(what, width, flights):
 @pytest.mark.parametrize("name", mission_names())
 def test_checks_of_shipped_missions_fit_eighty_columns(name):
     """The check and the phases of every shipped mission are whole on 80 columns."""
+    mission = rf.load_mission(name)
+    findings = check(mission)
     for width in (80, 132):
-        assert_whole(check(name), width)
-        assert_whole(rf.load_mission(name), width)
+        assert_whole(findings, width)
+        assert_whole(mission, width)
 
 
 @pytest.mark.long

@@ -41,17 +41,22 @@ def test_unknown_name():
         rigidfleet.fly_me  # noqa: B018  # ty: ignore[missing-attribute]
 
 
-@pytest.mark.parametrize("name", sorted(set(rigidfleet.__all__) - {"__version__"}))
 @pytest.mark.parametrize("first", ["import rigidfleet.{home}", "pass"])
-def test_public_names(name, first):
+def test_public_names(first):
     """A public name is the function or class, also where its module, of the same name, was imported first."""
-    home = rigidfleet._HOME[name]
+    names = {
+        name: rigidfleet._HOME[name] for name in sorted({*rigidfleet.__all__} - {"__version__"})
+    }
     code = f"""
-import rigidfleet
-{first.format(home=home)}
-from rigidfleet.{home} import {name} as expected
-assert rigidfleet.{name} is expected, rigidfleet.{name}
-assert callable(expected)
+import importlib, sys
+for name, home in {names}.items():
+    for module in [x for x in sys.modules if x.partition(".")[0] == "rigidfleet"]:
+        del sys.modules[module]  # as if this were a new process, but for packages of others
+    import rigidfleet
+    exec({first!r}.format(home=home))
+    expected = getattr(importlib.import_module("rigidfleet." + home), name)
+    assert getattr(rigidfleet, name) is expected, name
+    assert callable(expected), name
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -157,10 +162,35 @@ def test_nothing_that_others_made_is_executed():
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> Path:
-    """A folder with the wheel and the sdist, built as `make package` does."""
+    """A folder with wheel and sdist: those of `make package` if they are of these sources, or built as it does."""
+    if versions.is_package_of(ROOT, ROOT / "dist"):
+        return ROOT / "dist"
     folder = tmp_path_factory.mktemp("dist")
     uv("build", "--build-constraints", "constraints.txt", "--out-dir", str(folder), ".")
     return folder
+
+
+def test_a_package_of_other_sources_is_none(tmp_path):
+    """A wheel is of these sources if its sdist has each file as it is now, and every file of the package."""
+    root, folder = tmp_path / "root", tmp_path / "dist"
+    (root / "src").mkdir(parents=True)
+    folder.mkdir()
+    (root / "src" / "a.py").write_text("a = 1\n")
+    (root / "pyproject.toml").touch()
+    with tarfile.open(folder / "p-1.tar.gz", "w:gz") as archive:
+        for name in ("src/a.py", "pyproject.toml"):
+            archive.add(root / name, f"p-1/{name}")
+    assert not versions.is_package_of(root, folder)  # no wheel
+    (folder / "p-1.whl").touch()
+    assert versions.is_package_of(root, folder)
+    (root / "src" / "b.py").touch()
+    assert not versions.is_package_of(root, folder)
+    (root / "src" / "b.py").unlink()
+    (root / "src" / "a.py").write_text("a = 2\n")
+    assert not versions.is_package_of(root, folder)
+    (root / "src" / "a.py").write_text("a = 1\n")
+    (root / "pyproject.toml").unlink()
+    assert not versions.is_package_of(root, folder)
 
 
 def uv(*words: str) -> None:

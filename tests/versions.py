@@ -6,7 +6,8 @@
 - with the pinned ones (`constraints.txt`), on each other Python of `PYTHONS` that is on this machine;
 - with the newest that can be had, on the newest of these.
 
-The pinned ones fly the wheel, which has been built once. The others compile: theirs is another compiler.
+The pinned ones fly the wheel: that of `make package` if it is of these sources, or one that is built here, once. The
+others compile: theirs is another compiler. Two environments fly at a time.
 
 Words choose among them: `python tests/versions.py newest`, or `pinned 3.12`.
 
@@ -21,10 +22,13 @@ import platform
 import shutil
 import subprocess
 import sys
+import tarfile
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
@@ -32,6 +36,8 @@ ROOT = Path(__file__).parents[1]
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 EXTRAS = "[analysis,cluster,show,mcap,rerun]"
 PINS = ("--build-constraints", "constraints.txt")
+#: Environments that fly at a time.
+AT_A_TIME = 2
 #: What is flown, by the command: all of its libraries of machine code, and each package that it or an extra needs.
 COMMANDS = (
     "run narrow-passage --figures all --format png --replay --out flown",
@@ -105,11 +111,40 @@ def environment(python: str, folder: Path) -> Path:
     return home / ("Scripts" if os.name == "nt" else "bin") / "python"
 
 
+def is_package_of(root: Path, folder: Path) -> bool:
+    """Whether a folder has a wheel beside an sdist whose files are those of ``root``, all of the package among them.
+
+    `make package` builds the wheel from the sdist, so that it is of these sources, too.
+    """
+    sdists = [*folder.glob("*.tar.gz")]
+    if len(sdists) != 1 or len([*folder.glob("*.whl")]) != 1:
+        return False
+    with tarfile.open(sdists[0]) as archive:
+        held = {
+            member.name.partition("/")[2]: stream.read()
+            for member in archive
+            if (stream := archive.extractfile(member))
+        }
+    held.pop("PKG-INFO", None)
+    files = {p.relative_to(root).as_posix() for p in (root / "src").rglob("*") if p.is_file()}
+    return {name for name in files if "__pycache__" not in name} <= {*held} and all(
+        (root / name).is_file() and (root / name).read_bytes() == content
+        for name, content in held.items()
+    )
+
+
 @cache
 def wheel(place: Path) -> Path:
-    """The wheel, built into a folder."""
-    uv("build", "--quiet", "--wheel", *PINS, "--out-dir", place, ".")
-    return next(place.glob("*.whl"))
+    """The wheel of these sources: that of `make package`, or built into a folder."""
+    made = ROOT / "dist"
+    if not is_package_of(ROOT, made):
+        uv("build", "--quiet", "--wheel", *PINS, "--out-dir", place, ".")
+        made = place
+    return next(made.glob("*.whl"))
+
+
+#: Of two environments that need the wheel, one builds it.
+_BUILDING = Lock()
 
 
 def fly(python: Path, folder: Path) -> None:
@@ -139,8 +174,8 @@ def main() -> int:
         plan.insert(0, ("lowest", PYTHONS[0], "constraints-lowest.txt"))
     plan.append(("newest", [*here][-1], os.devnull))
     plan = [entry for entry in plan if {*sys.argv[1:]} <= {*entry}]
-    with tempfile.TemporaryDirectory() as place:
-        failed = [fly_or_tell(*entry, here[entry[1]], Path(place)) for entry in plan]
+    with tempfile.TemporaryDirectory() as place, ThreadPoolExecutor(AT_A_TIME) as pool:
+        failed = [*pool.map(lambda entry: fly_or_tell(*entry, here[entry[1]], Path(place)), plan)]
     if missing := [version for version in PYTHONS if version not in here]:
         print(f"Python {', '.join(missing)}: not on this machine, not flown")
     return int(any(failed))
@@ -152,7 +187,8 @@ def fly_or_tell(what: str, version: str, constraints: str, python: str, place: P
     words = f"{what} versions, Python {version}"
     try:
         there = environment(python, folder)
-        package = str(wheel(place)) if what == "pinned" else "."
+        with _BUILDING:
+            package = str(wheel(place)) if what == "pinned" else "."
         uv(
             "pip", "install", "--quiet", "--python", there, "--constraints", constraints, *PINS,
             *(("--editable",) if what != "pinned" else ()), f"{package}{EXTRAS}",
