@@ -498,7 +498,7 @@ def _smoothness_rules(m: Draft, p: Phase, k: int) -> Breaches:
     """A smooth mission can be smooth, and others use nothing that only smooth ones have."""
     if not m.is_valid((), "smoothness"):
         return
-    through = getattr(p, "through", ())
+    through = p.points
     if not m.is_smooth:
         for key in [*p.auto_keys, *(["through"] if through else [])]:
             problem = "needs a smooth mission" + (" to have a least time" if key in TIMES else "")
