@@ -185,10 +185,6 @@ def _chunk_shape(shape: tuple[int, ...]) -> tuple[int, ...] | None:
 def _read_result_bytes(path: Path) -> bytes:
     try:
         data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise ResultError(f"{path}: no such file. `rigidfleet run` creates results.") from error
-    except IsADirectoryError as error:
-        raise ResultError(f"{path}: is a folder. Give the path of a result file in it.") from error
     except OSError as error:
         raise ResultError(f"{path}: {os_error_in_words(error, 'read', path)}") from error
     if not data.startswith(b"\x89HDF\r\n\x1a\n"):
