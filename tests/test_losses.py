@@ -606,7 +606,7 @@ def test_check_tells_what_a_link_does_to_rigidity():
             "phases[2].control", "only tracked slots can brake",
         ),
         ({"network": CUT}, "network", "needs sampled control"),
-        ({"phases": [*PHASES, {"kind": "brake", "settle": {}}]}, "phases[4].settle", "needs a time of arrival"),
+        ({"phases": [*PHASES, {"kind": "brake", "settle": {}}]}, "phases[4].settle", "needs a time at which it ends"),
         (
             {"phases": [*PHASES, {"kind": "brake", "duration": 2.0, "travel": 3.0}]}, "phases[4].travel",
             "is longer than the phase",

@@ -578,7 +578,7 @@ def test_missions_cross_processes():
         (("phases/1", ORBIT | {"yaw": "free"}), "phases[2].yaw", "'fixed' or 'along'", "use fixed"),
         (("phases/1", ORBIT | {"control": "open"}), "phases[2].control", "needs feedback control", "'tracking'"),
         (("phases/1", ORBIT | {"control": "body"}), "phases[2].control", "architecture = 'body'", "tracking"),
-        (("phases/1", ORBIT_SETTLES), "phases[2].settle", "never settles", "duration or until"),
+        (("phases/1", ORBIT_SETTLES), "phases[2].settle", "needs a time at which it ends", "duration or until"),
         (("output_step", 30.0), "output_step", "longer than the mission", "reduce"),
         (("output_step", 1e-6), "output_step", "would have 2e+07 samples", "or more"),
         (("output_step", 0), "output_step", "must be > 0", "[s]"),

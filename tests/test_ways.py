@@ -194,7 +194,7 @@ def test_the_shipped_passage_folds_by_itself():
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
-        ({"duration": None, "settle": {}}, "needs a time of arrival"),
+        ({"duration": None, "settle": {}}, "needs a time at which it ends"),
         ({"control": "open"}, "needs feedback control"),
         ({"formations": FORMS, "clearance": -1.0}, "clearance"),
         ({"scales": [1.5]}, "scales"),

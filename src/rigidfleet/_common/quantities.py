@@ -94,10 +94,6 @@ def _motion_quantity(order: int, way: str, what: str, unit: str) -> Quantity:
     )  # fmt: skip
 
 
-def _has_no_fence(mission: Any) -> bool:
-    return mission.limits.geofence is None
-
-
 #: Quantities in the order in which verdicts and pages have them.
 QUANTITIES: dict[str, Quantity] = {
     q.name: q
@@ -130,7 +126,7 @@ QUANTITIES: dict[str, Quantity] = {
         ),
         Quantity(
             "geofence", "m", "greatest distance of a vehicle's centre outside the geofence; negative inside",
-            key="limits.geofence", limit=lambda m: None if _has_no_fence(m) else 0.0,
+            key="limits.geofence", limit=lambda m: m.limits.geofence and 0.0,
         ),
         *(
             Quantity(
@@ -146,11 +142,11 @@ QUANTITIES: dict[str, Quantity] = {
         ),
         Quantity(
             "lowest", "m", "least altitude of a vehicle's centre", sense="least", checked=False,
-            limit=lambda m: None if _has_no_fence(m) else m.limits.geofence.min[2],
+            limit=lambda m: m.limits.geofence and m.limits.geofence.min[2],
         ),
         Quantity(
             "highest", "m", "greatest altitude of a vehicle's centre", checked=False,
-            limit=lambda m: None if _has_no_fence(m) else m.limits.geofence.max[2],
+            limit=lambda m: m.limits.geofence and m.limits.geofence.max[2],
         ),
         *(
             _motion_quantity(order, way, what, unit)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
-from rigidfleet.errors import RigidfleetError
+from cyclopts import Parameter, validators
 
 
 def to_whole_number(_type: Any, tokens: Sequence[Any]) -> int:
@@ -14,16 +14,10 @@ def to_whole_number(_type: Any, tokens: Sequence[Any]) -> int:
     return parse_whole(tokens[0].value)
 
 
-def check_workers(workers: int | None) -> None:
-    """Refuse fewer than one process.
-
-    Raises
-    ------
-    RigidfleetError
-        The number is not positive.
-    """
-    if workers is not None and workers < 1:
-        raise RigidfleetError(f"--workers = {workers}: must be at least 1.")
+#: A number of processes.
+Workers = Annotated[
+    int | None, Parameter(converter=to_whole_number, validator=validators.Number(gte=1))
+]
 
 
 def parse_number(text: str, what: str = "") -> float:

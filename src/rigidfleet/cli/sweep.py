@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import check_workers, to_whole_number
+from rigidfleet.cli.arguments import Workers, to_whole_number
 from rigidfleet.cli.codes import BAD_INPUT, INTERRUPTED, PASSED
 from rigidfleet.cli.run import DRAWN, Format, show_progress
 from rigidfleet.errors import RigidfleetError
@@ -36,7 +36,7 @@ def sweep(
     controller: str | None = None,
     rate: float | None = None,
     agent: str | None = None,
-    workers: Annotated[int | None, Parameter(converter=to_whole_number)] = None,
+    workers: Workers = None,
     cluster: str | None = None,
     shard: str = "",
     merge: bool = False,
@@ -114,7 +114,6 @@ def sweep(
     quiet : bool
         Print only errors, and JSON with --json.
     """
-    check_workers(workers)
     if merge + summary + bool(shard) > 1:
         raise RigidfleetError("--shard, --merge and --summary exclude each other: use one of them.")
     from rigidfleet._common.files import write_file

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import check_workers, to_whole_number
+from rigidfleet.cli.arguments import Workers, to_whole_number
 from rigidfleet.cli.codes import INTERRUPTED, PASSED
 from rigidfleet.cli.run import show_progress
 from rigidfleet.errors import RigidfleetError
@@ -26,7 +26,7 @@ def tune(
     seed: Annotated[int, Parameter(converter=to_whole_number)] = 0,
     margin_share: float = 1.0,
     assume: list[str] | None = None,
-    workers: Annotated[int | None, Parameter(converter=to_whole_number)] = None,
+    workers: Workers = None,
     out: Path | None = None,
     force: bool = False,
     json: bool = False,
@@ -71,7 +71,6 @@ def tune(
     from rigidfleet.mission import load_mission
     from rigidfleet.tuning import tune as study
 
-    check_workers(workers)
     loaded = load_mission(mission)
     folder = out or Path("tunes", loaded.name)
     try:

@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidfleet.mission.disturbances import gust_intensity
 from rigidfleet.mission.rules import Breach, Breaches, Draft
-from rigidfleet.mission.schema import Avoidance, Disturbances
+from rigidfleet.mission.schema import Avoidance, Disturbances, Noise
 from rigidfleet.mission.vehicles import NOT_SAMPLED, VehicleModel, model_of_vehicle
 from rigidfleet.typing import Floats
 
@@ -57,20 +57,24 @@ def _disturbing_accelerations(
     return np.array(by_wind) + np.where(error > 0.0, limit, gravity) * np.abs(error)
 
 
+def _noise_of(disturbances: Disturbances | None) -> Noise:
+    """The noise of measurements, which may be none."""
+    noise = None if disturbances is None else disturbances.noise
+    return Noise.model_construct() if noise is None else noise
+
+
 def reaction_times(models: Sequence[VehicleModel], disturbances: Disturbances | None) -> Floats:
     """Time (N,) [s] until a commanded force acts: a measurement's delay; of quadrotors also motors and attitude.
 
     The attitude loop follows a ramp late by k_omega / k_R.
     """
-    noise = None if disturbances is None else disturbances.noise
-    delay = 0.0 if noise is None else noise.delay
     own = [
         0.0
         if model.point
         else max(model.motor_time) + model.attitude_gains[1] / model.attitude_gains[0]
         for model in models
     ]
-    return delay + np.array(own)
+    return _noise_of(disturbances).delay + np.array(own)
 
 
 def lag_coefficients(
@@ -81,9 +85,7 @@ def lag_coefficients(
     Commands take the time in which the torques of hovering rotors turn the tilt from one limit to the other, so that
     attitude follows them linearly, and no thrust is lost to torques.
     """
-    noise = None if disturbances is None else disturbances.noise
-    delay = 0.0 if noise is None else noise.delay
-    lags = np.zeros((len(models), 3, 3))
+    delay, lags = _noise_of(disturbances).delay, np.zeros((len(models), 3, 3))
     for i, model in enumerate(models):
         if not model.point:
             k_R, k_omega = model.attitude_gains
@@ -101,9 +103,8 @@ def extra_radii(
     """By how much each vehicle is taken to be larger (N,) [m]: by noise, and by what lags leave out."""
     if table.margin is not None:
         return np.full(len(models), table.margin)
-    noise = None if disturbances is None else disturbances.noise
     own = np.array([0.0 if model.point else _LEFT_OUT for model in models])
-    return own + (0.0 if noise is None else _SIGMAS * noise.position)
+    return own + _SIGMAS * _noise_of(disturbances).position
 
 
 def why_no_guarantee(

@@ -72,6 +72,7 @@ def disturbance_rules(m: Draft) -> Breaches:
 def _gust_rules(m: Draft, gusts: Gusts, wind: bool) -> Breaches:
     """Gusts have the keys of their model, and no others."""
     spread = "add the standard deviation of the gusts [m/s]"
+    yield from idle_key_rules(gusts, "time_scale", "model", "first-order")
     if gusts.model == "first-order":
         if gusts.time_scale is None:
             yield Breach("time_scale", "is missing", "add the correlation time of the gusts [s]")
@@ -80,9 +81,6 @@ def _gust_rules(m: Draft, gusts: Gusts, wind: bool) -> Breaches:
         if gusts.intensity is None:
             yield Breach("intensity", "is missing", spread)
     else:
-        if gusts.time_scale is not None:
-            remedy = "give length or altitude instead, or use model = 'first-order'"
-            yield Breach("time_scale", "has no effect with model 'dryden'", remedy)
         if gusts.length is not None and gusts.altitude is not None:
             yield Breach("length", "is given together with altitude", "give one of them")
         if gusts.length is gusts.altitude is None:

@@ -133,7 +133,8 @@ class FindingCollector:
         for step in error["loc"]:
             if isinstance(here, dict) and (step in here or error["type"] == "missing"):
                 owner, here = inner, here.get(step)
-                inner = _model_at(owner, step)
+                field = owner.model_fields.get(str(step))
+                inner = (model_of(field.annotation) if field else None) or owner
             elif isinstance(here, list) and isinstance(step, int):
                 here = here[step]
             else:
@@ -203,12 +204,6 @@ def _finding_count_key(path: Keys, problem: str) -> Keys:
     return tuple(_ANY if isinstance(step, int) else step for step in path)
 
 
-def _model_at(owner: type[Part], key: object) -> type[Part]:
-    """Model of a key, or its owner if it has none."""
-    field = owner.model_fields.get(str(key))
-    return (model_of(field.annotation) if field else None) or owner
-
-
 def model_of(annotation: Any) -> type[Part] | None:
     """First model in an annotation such as `Settle | None`; None if there is none."""
     return next(_models_in_annotation(annotation), None)
@@ -233,7 +228,7 @@ def _problem_and_remedy(error: Any, path: Keys, owner: type[Part]) -> tuple[str,
         case "missing":
             return "is missing", f"add {meaning or name}"
         case "literal_error":
-            words = _quoted_words(context["expected"])
+            words = re.findall(r"'([^']*)'", context["expected"]) or [context["expected"]]
             suggestion = rename_hint(name, error["input"]) or suggest(error["input"], words)
             usual = "none" if error["input"] in _OFF and "none" in words else words[0]
             return f"must be {context['expected']}", suggestion or f"use {usual}"
@@ -246,10 +241,6 @@ def _problem_and_remedy(error: Any, path: Keys, owner: type[Part]) -> tuple[str,
             return f"must have {count} numbers, not {context['actual_length']}", meaning
     problem = _PROBLEMS.get(kind, error["msg"][:1].lower() + error["msg"][1:])
     return problem.format_map(context), meaning
-
-
-def _quoted_words(expected: str) -> Sequence[str]:
-    return re.findall(r"'([^']*)'", expected) or [expected]
 
 
 _PROBLEMS = {

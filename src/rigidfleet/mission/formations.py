@@ -15,7 +15,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import FindingCollector, Keys, suggest_shape
-from rigidfleet.mission.rules import Breach, Breaches, Draft
+from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key_rules
 from rigidfleet.mission.schema import Formation
 
 #: Maximum number of contradictions among distances that are listed.
@@ -204,8 +204,7 @@ def _edge_rules(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
 
 def _graph_rules(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
     """A named graph can be derived from the slots; all except 'complete' are."""
-    if form.edges != "neighbours" and "reach" in form.model_fields_set:
-        yield Breach("reach", f"has no effect with edges '{form.edges}'", "remove it")
+    yield from idle_key_rules(form, "reach", "edges", "neighbours")
     if form.edges == "complete":
         return
     right = m.is_valid(path, "shape", "size", "slots")

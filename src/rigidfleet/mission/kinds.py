@@ -121,8 +121,8 @@ class AnyPhase(Part):
 
     @property
     def turns_away(self) -> bool:
-        """Whether the phase ends in an attitude that no key commands."""
-        return False
+        """Whether the phase ends in an attitude that no key commands: turned by its file or its orbit."""
+        return self.__dict__.get("yaw") in ("file", "along")
 
     @property
     def rest_position(self) -> values.Vector | None:
@@ -131,8 +131,8 @@ class AnyPhase(Part):
 
     @property
     def points(self) -> "tuple[Through, ...]":
-        """Points to pass on the way."""
-        return ()
+        """Points to pass on the way, of a kind that has `through`."""
+        return self.__dict__.get("through", ())
 
     @property
     def vertical(self) -> "Vertical | None":
@@ -146,8 +146,8 @@ class AnyPhase(Part):
 
     @property
     def has_bent_ways(self) -> bool:
-        """Whether the phase leads its vehicles on bent ways to a formation."""
-        return False
+        """Whether the phase leads its vehicles on bent ways to a formation: they have been found, or given."""
+        return self.__dict__.get("control_points") is not None
 
     @property
     def auto_keys(self) -> list[str]:
@@ -298,11 +298,6 @@ class Reshape(Shaping):
         """Whether the ways are straight, or given."""
         return self.transition == "straight"
 
-    @property
-    def has_bent_ways(self) -> bool:
-        """Whether ways have been found, or given."""
-        return self.control_points is not None
-
 
 class Steering(Attitude, AnyPhase):
     """A phase that can change the attitude."""
@@ -352,11 +347,6 @@ class Fly(Steering):
         "`through = [{ position = [x, y, z], time = 4.0, velocity = [vx, vy, vz] }]`",
         (),
     )
-
-    @property
-    def points(self) -> tuple[Through, ...]:
-        """The points of `through`."""
-        return self.through
 
     @property
     def commanded_at_arrival(self) -> tuple[str, ...]:
@@ -433,6 +423,7 @@ class Vertical(Arriving):
     """A phase that leads vehicles straight up or down: all together, some of them, or one group after another."""
 
     grounded: ClassVar[bool] = True
+    commanded_at_arrival: ClassVar[tuple[str, ...]] = ("position", "velocity")
 
     agents: tuple[values.AgentNumber, ...] = key(
         "numbers of the vehicles that move; the others stay. Default: all", ()
@@ -459,36 +450,24 @@ class Vertical(Arriving):
     @property
     def arrival_height(self) -> float | None:
         """Height of all vehicles above the ground on arrival [m]; None to come down to it."""
-        return None
+        return self.__dict__.get("height")
 
     @property
     def has_way_per_vehicle(self) -> bool:
         """Whether each vehicle has a way of its own, so that the shape may change."""
         return bool(self.agents) or self.stagger is not None
 
-    @property
-    def commanded_at_arrival(self) -> tuple[str, ...]:
-        """Position and velocity on arrival."""
-        return ("position", "velocity")
-
 
 class Takeoff(Vertical):
     """Climb straight up from the ground, until all vehicles are at one height."""
+
+    #: Vehicles that stand on different heights come level.
+    has_way_per_vehicle: ClassVar[bool] = True
 
     kind: Literal["takeoff"] = required_key("climb straight up to a level height")
     height: values.Length = required_key(
         "height of the vehicles' centres above the ground on arrival [m]"
     )
-
-    @property
-    def arrival_height(self) -> float | None:
-        """The height."""
-        return self.height
-
-    @property
-    def has_way_per_vehicle(self) -> bool:
-        """Always: vehicles that stand on different heights come level."""
-        return True
 
     @property
     def leads_to(self) -> str:
@@ -500,6 +479,7 @@ class Land(Vertical):
     """Descend straight down, until the lowest vehicle is just above the ground; staggered, until each is."""
 
     lands: ClassVar[bool] = True
+    leads_to: ClassVar[str] = "the ground"
 
     kind: Literal["land"] = required_key("descend straight down to the ground")
     places: Literal["below", "own"] = key(
@@ -507,11 +487,6 @@ class Land(Vertical):
         "start, straight or by levels, on ways that are proved, and then down",
         "below",
     )
-
-    @property
-    def leads_to(self) -> str:
-        """The ground."""
-        return "the ground"
 
 
 class Cruising(AnyPhase):
@@ -572,11 +547,6 @@ class Follow(Cruising):
         return join_curves([rows_to_curve(rows) for rows in self.trajectories or ()], _COEFFICIENTS)
 
     @property
-    def turns_away(self) -> bool:
-        """Whether the body turns as the file says."""
-        return self.yaw == "file"
-
-    @property
     def leads_to(self) -> str:
         """The trajectories."""
         n = len(self.trajectories or ())
@@ -616,11 +586,6 @@ class Orbit(Cruising):
         "the limits",
         4.0,
     )
-
-    @property
-    def turns_away(self) -> bool:
-        """Whether the body turns with the orbit."""
-        return self.yaw == "along"
 
     @property
     def leads_to(self) -> str:

@@ -12,7 +12,8 @@ from rigidfleet.mission.findings import Keys, suggest
 from rigidfleet.mission.formations import has_no_findings
 from rigidfleet.mission.kinds import AnyPhase, seconds
 from rigidfleet.mission.obstacles import is_ground
-from rigidfleet.mission.rules import Breach, Breaches, Draft
+from rigidfleet.mission.phases import named_agent_rules
+from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key_rules
 from rigidfleet.mission.schema import Aborting, Disturbances
 from rigidfleet.typing import Floats
 
@@ -49,9 +50,7 @@ def loss_rules(m: Draft) -> Breaches:
         problem = "needs vehicles that fly by themselves: without [network], one law commands all"
         yield Breach((_TABLE, "stuck"), problem, "add [network], or remove it", None)
     for key, needed in ON_LOSS.items():
-        if getattr(d, key) is not None and d.on_loss != needed:
-            problem = f"has no effect with on_loss '{d.on_loss}'"
-            yield Breach((_TABLE, key), problem, f"remove it or use on_loss = '{needed}'")
+        m.record_breaches((_TABLE,), idle_key_rules(d, key, "on_loss", needed))
     times = [lost.time for lost in (*d.lost, *links)]
     if d.on_loss == "continue" or not times or m.n is None or m.findings:
         return
@@ -70,9 +69,7 @@ def _abort_rules(m: Draft) -> Breaches:
     """An abort is ordered in time, while slots are tracked."""
     options: Aborting | None = m.abort
     if options is not None:
-        for k, agent in enumerate(options.agents):
-            again = "leaves twice" if agent in options.agents[:k] else ""
-            yield from agent_rules(m, ("abort", "agents", k), (agent,), again)
+        yield from named_agent_rules(m, options.agents, "abort", "agents")
     if options is None or options.at is None or m.end is None or m.findings:
         return
     begins = options.at + options.reaction

@@ -4,7 +4,7 @@ import math
 from abc import abstractmethod
 from functools import cached_property
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -214,14 +214,12 @@ class Heights(Solid):
 class Ground(Part):
     """Everything below a height."""
 
+    #: A ground is no zone.
+    zone: ClassVar[bool] = False
+
     kind: Literal["ground"] = required_key("everything below a height")
     name: str = key("name; default: 'ground'", "")
     height: values.Coordinate = key("height of the ground [m]", 0.0)
-
-    @property
-    def zone(self) -> bool:
-        """A ground is no zone."""
-        return False
 
     @property
     def box_bounds(self) -> tuple[float, ...] | None:

@@ -33,7 +33,7 @@ from rigidfleet.mission.kinds import (
     Turn,
     seconds,
 )
-from rigidfleet.mission.rules import Breach, Breaches, Draft
+from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key_rules
 from rigidfleet.mission.schema import Formation
 from rigidfleet.mission.values import AUTO
 
@@ -172,9 +172,7 @@ def _motion_time_rules(m: Draft, p: Phase, k: int, longest: float | None) -> Bre
     if not m.is_valid(("phases", k), "reference", *_ENDINGS):
         return
     if p.shaping is not None and p.shaping.reference == "step":
-        if "blend" in p.model_fields_set:
-            remedy = "remove it, or use reference = 'shape' or 'distances'"
-            yield Breach("blend", "has no effect with reference 'step'", remedy)
+        yield from idle_key_rules(p, "blend", "reference", "shape")
     elif longest is None or p.follows_curves or not lasts > longest * (1 + 1e-9):
         return
     elif hasattr(p, "blend"):
@@ -261,11 +259,7 @@ def _establish_rules(m: Draft, p: Establish, k: int, _: float | None) -> Breache
 
 def _orbit_rules(m: Draft, p: Orbit, k: int, longest: float | None) -> Breaches:
     """An orbit has tracked slots, a rate within bounds, and an end."""
-    if p.control == "body":
-        problem = "an orbit cannot be flown by a wrench on the virtual body"
-        yield Breach("control", problem, "use control = 'tracking'")
-    if p.settle is not None:
-        yield Breach("settle", "an orbit never settles", "end it by duration or until")
+    yield from _tracked_way_rules(m, p, k, longest)
     if not m.is_valid(("phases", k), "radius"):
         return
     rate = abs(np.deg2rad(p.rate_deg_s))
@@ -286,7 +280,7 @@ def _tracked_way_rules(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
         problem = f"kind '{p.kind}' cannot be flown by a wrench on the virtual body"
         yield Breach("control", problem, "use control = 'tracking'")
     if p.settle is not None:
-        problem = f"kind '{p.kind}' needs a time of arrival"
+        problem = f"kind '{p.kind}' needs a time at which it ends"
         yield Breach("settle", problem, "end it by duration or until", None)
 
 
@@ -498,7 +492,7 @@ def _smoothness_rules(m: Draft, p: Phase, k: int) -> Breaches:
     """A smooth mission can be smooth, and others use nothing that only smooth ones have."""
     if not m.is_valid((), "smoothness"):
         return
-    through = getattr(p, "through", ())
+    through = p.points
     if not m.is_smooth:
         for key in [*p.auto_keys, *(["through"] if through else [])]:
             problem = "needs a smooth mission" + (" to have a least time" if key in TIMES else "")

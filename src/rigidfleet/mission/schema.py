@@ -17,12 +17,6 @@ from rigidfleet._common.waypoints import SHAPE_TOLERANCE
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import pid, rigid_body
 from rigidfleet.mission import bounds, values
-from rigidfleet.mission.bounds import (
-    ACCELERATION,
-    FORCE,
-    GAIN,
-    MASS,
-)
 from rigidfleet.mission.fences import Fence, People
 from rigidfleet.mission.kinds import Phase
 from rigidfleet.mission.obstacles import Obstacle
@@ -195,9 +189,11 @@ class Avoidance(Part):
 class Agents(Part):
     """The vehicles of the fleet. After the check, each field has one entry per agent."""
 
-    mass: Annotated[tuple[values.Mass, ...], values.number_or_list(MASS.least)] = required_key(
-        "mass [kg], > 0: one number for all agents, or a list with one per agent; with vehicle, it is the "
-        "vehicle's"
+    mass: Annotated[tuple[values.Mass, ...], values.number_or_list(bounds.MASS.least)] = (
+        required_key(
+            "mass [kg], > 0: one number for all agents, or a list with one per agent; with vehicle, it is the "
+            "vehicle's"
+        )
     )
     vehicle: Annotated[tuple[str, ...], values.NAME_OR_LIST] = key(
         "name of a table [vehicles.NAME], or a list with one name per agent; default: point masses that "
@@ -219,10 +215,12 @@ class Agents(Part):
         "radius of the sphere around an agent that must not touch anything [m]: a number or a list",
         (0.25,),
     )
-    thrust_limit: Annotated[tuple[values.Limit, ...], values.number_or_list(FORCE.least)] = key(
-        "maximum thrust |f_u + f_C| [N], of input and constraint force together: a number or a list; "
-        "default: unlimited",
-        (math.inf,),
+    thrust_limit: Annotated[tuple[values.Limit, ...], values.number_or_list(bounds.FORCE.least)] = (
+        key(
+            "maximum thrust |f_u + f_C| [N], of input and constraint force together: a number or a list; "
+            "default: unlimited",
+            (math.inf,),
+        )
     )
     saturate: values.Flag = key(
         "true: thrust is clipped at thrust_limit; false: the verdict compares it with thrust_limit",
@@ -248,7 +246,7 @@ class Constraint(Part):
 
     alpha: values.Gain = key("alpha [1/s], > 0; the feedback gain of dc/dt is 2 alpha", 3.0)
     beta: values.Gain = key("beta [1/s], > 0; the feedback gain of c is beta^2", math.sqrt(12))
-    gamma: Annotated[float, Strict(), values.signed_number_field(GAIN, 3)] = key(
+    gamma: Annotated[float, Strict(), values.signed_number_field(bounds.GAIN, 3)] = key(
         "feedback gain of the integral of c [1/s^3], >= 0, < 2 alpha beta^2", 8.0
     )
     stabilisation: Literal["pid", "none"] = key(
@@ -273,8 +271,8 @@ class Constraint(Part):
         "fade out smoothly",
         1e-3,
     )
-    deformation_damping: Annotated[float, Strict(), values.number_from_zero_field(GAIN)] = key(
-        "damping of deformation velocities while no slots are tracked [1/s], >= 0", 1.0
+    deformation_damping: Annotated[float, Strict(), values.number_from_zero_field(bounds.GAIN)] = (
+        key("damping of deformation velocities while no slots are tracked [1/s], >= 0", 1.0)
     )
 
     @property
@@ -321,7 +319,7 @@ class Tracking(Part):
 
     Q: values.Weights = key("weights [position error, velocity error], the first > 0", (4.0, 4.0))
     R: values.Cost = key("weight of the acceleration, > 0", 1.0)
-    integral: Annotated[float, Strict(), values.number_from_zero_field(GAIN)] = key(
+    integral: Annotated[float, Strict(), values.number_from_zero_field(bounds.GAIN)] = key(
         "gain of the integral of the position error [1/s^3], >= 0; frozen while a vehicle saturates; only "
         "with [vehicles]",
         0.0,
@@ -768,7 +766,7 @@ class MissionHeader(Part):
         "more of a distance above each other than beside",
         1.0,
     )
-    gravity: Annotated[float, Strict(), values.number_from_zero_field(ACCELERATION)] = key(
+    gravity: Annotated[float, Strict(), values.number_from_zero_field(bounds.ACCELERATION)] = key(
         "gravity [m/s^2], >= 0", 9.81
     )
     output_step: values.Time = key("time between samples of the result [s]", 0.05)

@@ -13,20 +13,6 @@ from pydantic import (
 )
 
 from rigidfleet.mission import bounds
-from rigidfleet.mission.bounds import (
-    ACCELERATION,
-    ANGLE,
-    FORCE,
-    GAIN,
-    JERK,
-    LENGTH,
-    MASS,
-    SPEED,
-    TIME,
-    TOLERANCE,
-    WEIGHT,
-    Bound,
-)
 
 #: Bound on all numbers: larger than any quantity in SI units here, and its sixth power is still finite.
 HUGE = 1e15
@@ -37,38 +23,38 @@ Number = Annotated[float, Strict(), Field(ge=-HUGE, le=HUGE)]
 Positive = Annotated[float, Strict(), Field(gt=0, le=HUGE)]
 
 
-def signed_number_field(bound: Bound, power: int = 1) -> Any:
+def signed_number_field(bound: bounds.Bound, power: int = 1) -> Any:
     """A number of either sign within the bound, or its power."""
     return Field(ge=-(bound.most**power), le=bound.most**power)
 
 
-def _positive_number_field(bound: Bound) -> Any:
+def _positive_number_field(bound: bounds.Bound) -> Any:
     return Field(ge=bound.least, le=bound.most)
 
 
-def number_from_zero_field(bound: Bound) -> Any:
+def number_from_zero_field(bound: bounds.Bound) -> Any:
     """A number from zero up to the bound."""
     return Field(ge=0, le=bound.most)
 
 
-Coordinate = Annotated[float, Strict(), signed_number_field(LENGTH)]
-Length = Annotated[float, Strict(), _positive_number_field(LENGTH)]
-LengthOrZero = Annotated[float, Strict(), number_from_zero_field(LENGTH)]
-Time = Annotated[float, Strict(), _positive_number_field(TIME)]
+Coordinate = Annotated[float, Strict(), signed_number_field(bounds.LENGTH)]
+Length = Annotated[float, Strict(), _positive_number_field(bounds.LENGTH)]
+LengthOrZero = Annotated[float, Strict(), number_from_zero_field(bounds.LENGTH)]
+Time = Annotated[float, Strict(), _positive_number_field(bounds.TIME)]
 #: A time of the mission, from its start on.
-Seconds = Annotated[float, Strict(), number_from_zero_field(TIME)]
-Speed = Annotated[float, Strict(), _positive_number_field(SPEED)]
-Spread = Annotated[float, Strict(), number_from_zero_field(SPEED)]
-Acceleration = Annotated[float, Strict(), _positive_number_field(ACCELERATION)]
-Jerk = Annotated[float, Strict(), _positive_number_field(JERK)]
-Mass = Annotated[float, Strict(), _positive_number_field(MASS)]
-Angle = Annotated[float, Strict(), signed_number_field(ANGLE)]
-Gain = Annotated[float, Strict(), signed_number_field(GAIN)]
-Weight = Annotated[float, Strict(), number_from_zero_field(WEIGHT)]
-Cost = Annotated[float, Strict(), _positive_number_field(WEIGHT)]
-Tolerance = Annotated[float, Strict(), _positive_number_field(TOLERANCE)]
+Seconds = Annotated[float, Strict(), number_from_zero_field(bounds.TIME)]
+Speed = Annotated[float, Strict(), _positive_number_field(bounds.SPEED)]
+Spread = Annotated[float, Strict(), number_from_zero_field(bounds.SPEED)]
+Acceleration = Annotated[float, Strict(), _positive_number_field(bounds.ACCELERATION)]
+Jerk = Annotated[float, Strict(), _positive_number_field(bounds.JERK)]
+Mass = Annotated[float, Strict(), _positive_number_field(bounds.MASS)]
+Angle = Annotated[float, Strict(), signed_number_field(bounds.ANGLE)]
+Gain = Annotated[float, Strict(), signed_number_field(bounds.GAIN)]
+Weight = Annotated[float, Strict(), number_from_zero_field(bounds.WEIGHT)]
+Cost = Annotated[float, Strict(), _positive_number_field(bounds.WEIGHT)]
+Tolerance = Annotated[float, Strict(), _positive_number_field(bounds.TOLERANCE)]
 #: Infinity is allowed here; a later check rejects it with its own remedy.
-Limit = Annotated[float, Strict(), Field(ge=FORCE.least, allow_inf_nan=True)]
+Limit = Annotated[float, Strict(), Field(ge=bounds.FORCE.least, allow_inf_nan=True)]
 Whole = Annotated[int, Strict(), Field(ge=-(2**31), lt=2**31)]
 Flag = Annotated[bool, Strict()]
 #: Number of an agent, from 1.
@@ -96,10 +82,12 @@ _ValueOrWord = Annotated[
 ]
 _Two, _Three = (Field(min_length=n, max_length=n) for n in (2, 3))
 Vector = Annotated[tuple[Coordinate, ...], _Three]
-Velocity = Annotated[tuple[Annotated[float, Strict(), signed_number_field(SPEED)], ...], _Three]
+Velocity = Annotated[
+    tuple[Annotated[float, Strict(), signed_number_field(bounds.SPEED)], ...], _Three
+]
 #: A velocity, or "free": any.
 VelocityOrFree = _ValueOrWord[Velocity, Literal["free"]]
-Force = Annotated[tuple[Annotated[float, Strict(), signed_number_field(FORCE)], ...], _Three]
+Force = Annotated[tuple[Annotated[float, Strict(), signed_number_field(bounds.FORCE)], ...], _Three]
 Rates = Annotated[tuple[Angle, ...], _Three]
 Weights = Annotated[tuple[Weight, ...], _Two]
 Size = _OneOrList[Length, Annotated[tuple[Length, ...], _Three]]

@@ -117,9 +117,7 @@ def validate_vehicles(m: Draft) -> None:
         return
     for name, data in tables.items():
         path = ("vehicles", name)
-        if not isinstance(data, dict):
-            m.add(path, "is not a table", f"write a table [vehicles.{name}]")
-        elif (vehicle := m.validate(Vehicle, data, path)) is not None:
+        if (vehicle := m.validate(Vehicle, data, path)) is not None:
             before = len(m.findings)
             m.record_breaches(path, _vehicle_rules(vehicle))
             if len(m.findings) == before:

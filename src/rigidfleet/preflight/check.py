@@ -58,9 +58,7 @@ def check(
     progress("planned paths")
     planned, known = preview_phases(mission)
     preflight = Preflight(mission, formations, check_gains(mission, formations), planned)
-    preflight.speed = trajectory.greatest_speed(planned, slice(3))
-    preflight.vertical_speed = trajectory.greatest_speed(planned, slice(2, 3))
-    preflight.thrust = trajectory.thrust_nearest_to_limit(mission, planned)
+    trajectory.find_greatest(mission, preflight)
     if not known:
         preflight.judged_to = float(planned[-1].time[-1]) if planned else 0.0
     if lags := vehicle_lags(mission):

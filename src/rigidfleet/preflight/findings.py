@@ -218,10 +218,6 @@ class FormationNetwork:
         within = self.own_loss <= share and self.own_delay_ticks <= self.delay_ticks
         return within and (self.growing or 0.0) <= 0.5
 
-    def weaker_of(self, other: FormationNetwork) -> FormationNetwork:
-        """The one of both that bears less."""
-        return min(self, other, key=lambda f: (f.bears_network, f.delay_ticks, f.loss or 0.0))
-
     @property
     def table_row(self) -> dict[str, Any]:
         """What it bears and what it has, by the names of columns; losses are stable in mean square."""

@@ -72,7 +72,8 @@ def check_network(
         check = FormationNetwork(
             flight.n / (radio.every * radio.tick), radio.tick, delay, latest, loss, own.loss, growing, unheard
         )  # fmt: skip
-        checks[name] = check.weaker_of(checks.get(name, check))
+        each = (check, checks.get(name, check))
+        checks[name] = min(each, key=lambda f: (f.bears_network, f.delay_ticks, f.loss or 0.0))
     return checks
 
 
@@ -80,8 +81,7 @@ def linear_flights(
     mission: Mission, way: Sequence[PlannedPhase], lags: Sequence[Lag]
 ) -> Iterator[tuple[str, LinearFlight, int]]:
     """Each formation under each law with which it is flown, and how many of its edges nobody hears along."""
-    if mission.network is None or mission.vehicle_models is None:
-        return
+    assert mission.vehicle_models is not None  # checked: [network] needs vehicles
     net, every = network_of(mission), _ticks_per_law(mission)
     radio = Radio(
         max(1, round(net.every / every)), math.ceil(net.delay / every), net.lag, every / mission.autopilot.rate

@@ -144,23 +144,19 @@ def _force_nearest_to_limit(
     return float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])
 
 
-def thrust_nearest_to_limit(
-    mission: Mission, way: list[PlannedPhase]
-) -> tuple[float, float, str, float] | None:
-    """The planned thrust [N] that is nearest to its limit, its time [s], agent and limit [N]; None without a plan."""
+def find_greatest(mission: Mission, preflight: Preflight) -> None:
+    """Find the greatest planned speeds [m/s] and the thrust [N] that is nearest to its limit, at samples."""
+    way = preflight.planned_phases
     if not way:
-        return None
+        return
     mass, weight = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
     needs = [mass * np.linalg.norm(planned.acceleration + weight, axis=2) for planned in way]
-    return _force_nearest_to_limit(way, needs, mission.fleet.thrust_limit)
-
-
-def greatest_speed(way: list[PlannedPhase], axes: slice) -> tuple[float, float, str] | None:
-    """Greatest planned speed [m/s] along some axes, its time [s] and agent, at samples; None without a plan."""
-    if not way:
-        return None
-    sizes = [np.linalg.norm(planned.velocity[..., axes], axis=2) for planned in way]
-    return _force_nearest_to_limit(way, sizes, np.full(sizes[0].shape[1], np.inf))[:3]
+    preflight.thrust = _force_nearest_to_limit(way, needs, mission.fleet.thrust_limit)
+    speeds = [np.linalg.norm(planned.velocity, axis=2) for planned in way]
+    climbs = [np.abs(planned.velocity[..., 2]) for planned in way]
+    unlimited = np.full(mission.n_agents, np.inf)
+    preflight.speed = _force_nearest_to_limit(way, speeds, unlimited)[:3]
+    preflight.vertical_speed = _force_nearest_to_limit(way, climbs, unlimited)[:3]
 
 
 def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:

@@ -76,8 +76,7 @@ def _damping_in_words(mission: Mission) -> str:
 def _tracking_lines(mission: Mission) -> list[GainLine]:
     if not any(phase.control == "tracking" for phase in mission.phases):
         return []
-    t = mission.tracking
-    k1, k2 = lqr.double_integrator_gains(t.Q, t.R)
+    k1, k2 = mission.tracking_gains
     meaning = f"each vehicle follows its slot: {_behaviour_in_words(k1, k2)}"
     return [("tracking", f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s", meaning)]
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from rigidfleet._common.files import os_error_in_words
 from rigidfleet._common.plain import to_json_text
 from rigidfleet.errors import ResultError, refuse_format
-from rigidfleet.result.phases import PhaseRecord
+from rigidfleet.result.phases import EXACT, PhaseRecord
 
 #: Version of the file format. Files of any other version are rejected.
 SCHEMA_VERSION = 4
@@ -45,19 +46,21 @@ LABELS: dict[str, tuple[str, ...]] = {
 }
 
 
-class Statistics(TypedDict, total=False):
+@dataclass
+class Statistics:
     """Statistics of the integrator. Other keys are allowed."""
 
-    __others__: Any
-    evaluations: int
-    steps: int
-    rejected: int
-    wall_s: float
-    simulated_s: float
-    rtol: float
-    atol: float
-    solvers: dict[str, dict[str, float]]
-    spans: list[tuple[float, float]]
+    __pydantic_config__: ClassVar = EXACT | {"extra": "allow"}
+
+    evaluations: int = 0
+    steps: int = 0
+    rejected: int = 0
+    wall_s: float = 0.0
+    simulated_s: float = 0.0
+    rtol: float = 0.0
+    atol: float = 0.0
+    solvers: dict[str, dict[str, float]] = field(default_factory=dict)
+    spans: list[tuple[float, float]] = field(default_factory=list)
 
 
 #: Attributes of a file and their types. Types other than int and str are stored as JSON.
@@ -162,7 +165,8 @@ def read_netcdf(path: Path, variables: Mapping[str, Variable]) -> dict[str, Any]
         }
         sizes = {dim: len(names) for dim, names in LABELS.items()}
         arrays = reader.read_arrays(file, due, sizes, len(data))
-    return arrays | attributes | {"complete": bool(attributes["complete"])}
+    phases = [PhaseRecord(**phase) for phase in attributes["phases"]]
+    return arrays | attributes | {"complete": bool(attributes["complete"]), "phases": phases}
 
 
 def _netcdf_attribute_name(name: str) -> str:
@@ -181,10 +185,6 @@ def _chunk_shape(shape: tuple[int, ...]) -> tuple[int, ...] | None:
 def _read_result_bytes(path: Path) -> bytes:
     try:
         data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise ResultError(f"{path}: no such file. `rigidfleet run` creates results.") from error
-    except IsADirectoryError as error:
-        raise ResultError(f"{path}: is a folder. Give the path of a result file in it.") from error
     except OSError as error:
         raise ResultError(f"{path}: {os_error_in_words(error, 'read', path)}") from error
     if not data.startswith(b"\x89HDF\r\n\x1a\n"):

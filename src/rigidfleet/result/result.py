@@ -584,12 +584,10 @@ VARIABLES: dict[str, Variable] = {
 #: states, and what is measured of that, as a rule; as a rule, with noise, too.
 LATER = ("slot_velocity", "slot_acceleration", "slot_jerk", "yaw", "yaw_rate")
 CLOSE = ("separation", "separation_pair", "clearance", "clearance_agent", "clearance_obstacle")
-RECORDED = (
-    "integral", "acceleration", "slot_position", "input_force", "constraint_force", "external_force", "thrust", "cm",
-    "cm_velocity", "cm_reference", "cm_velocity_reference", "attitude", "attitude_reference", "frame", "rates",
-    "rates_reference", "wrench_asked", "wrench_achieved", "distance", "distance_reference",
-    "distance_rate_reference", "constraint", "multiplier",
-)  # fmt: skip
+_FLOWN = ("time", "phase", "position", "velocity", "edges", "singular_value")
+RECORDED = tuple(
+    name for name, v in VARIABLES.items() if not (v.optional or name in (*_FLOWN, *CLOSE))
+)
 SEEN = ("measured_position", "measured_velocity")
 # The default of the field remains; without the class's attribute, `__getattr__` is called.
 for _name in (*LATER, *SEEN, "disturbance_force"):

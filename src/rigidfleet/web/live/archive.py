@@ -55,10 +55,6 @@ class Archive:
             pieces.append(select_rows(every, np.unique(every.time, return_index=True)[1].tolist()))
         return pieces
 
-    def has_phase(self, phase: int) -> bool:
-        """Whether there is a sample of a phase."""
-        return any(key[0] == phase for key in self.phases)
-
     def _is_multiple(self, time: Floats) -> Bools:
         """Which times are multiples of the step."""
         away = time / self.step

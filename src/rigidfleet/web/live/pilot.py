@@ -340,7 +340,7 @@ class Pilot:
         step = self.archive.step
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.arange(low, high) * step
-        begun = self.archive.has_phase(len(self.flight.phases) - 1)
+        begun = any(key[0] == len(self.flight.phases) - 1 for key in self.archive.phases)
         start = [] if begun else [t and np.nextafter(t, math.inf)]
         return np.concatenate([start, grid[grid < t_end - 1e-9], [t_end]])
 

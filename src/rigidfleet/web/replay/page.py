@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import posixpath
 import re
 from collections.abc import Iterator
 from importlib import resources
 from typing import Any
 
-from rigidfleet._common.plain import to_json_data
+from rigidfleet._common.plain import to_json_text
 from rigidfleet._common.templates import templates
 from rigidfleet.web.policy import content_policy
 
@@ -38,7 +37,7 @@ def page(
         title=f"{info['name']} – rigidfleet",
         style=style,
         # No markup inside: a user's text must not end the script.
-        info=json.dumps(to_json_data(info), ensure_ascii=False).replace("<", "\\u003c"),
+        info=to_json_text(info).replace("<", "\\u003c"),
         data=data,
         script=script,
     )
