@@ -474,7 +474,7 @@ def fly_with(plain: str) -> None:
         for step in range(first, end):
             row = monitor.trail_row_of(step, state)
             t, h = state.trail.clock[row]
-            obstacles.watch_step(state.trail.points[row], t, h, problem, s, watch.monitor)
+            obstacles.watch_clearances(state.trail.points[row], t, h, problem, s, watch.monitor)
 
     def search_forces(watch: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
         monitor.watch_forces(int(last), problem, work, state, watch.monitor)

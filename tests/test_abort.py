@@ -306,7 +306,7 @@ def test_what_follows_if_one_does_not_hear() -> None:
     aborts = aborts_of(show())
     plain = rf.simulate(aborts.mission, times=np.linspace(0.0, 24.0, 4801))
     abort = aborts.abort_at(7.0)
-    each = aborts.nearness_if_not_heard(abort)
+    each = aborts.nearness_if_unheard(abort)
     told = min(each)
     t = plain.time[(plain.time > abort.begins) & (plain.time < min(abort.rest_time, 24.0))]
     r, on = abort.positions_at(t), plain.position[np.searchsorted(plain.time, t)]

@@ -8,7 +8,7 @@ from rigidfleet.assessment import assess
 from rigidfleet.math.margins import Lag, LoopGains, tracking_error_gain
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import MODELS
-from rigidfleet.planning.vehicles import overshoot_times
+from rigidfleet.planning.vehicles import tracking_lag_times
 from rigidfleet.preflight.check import check
 from rigidfleet.simulation.flight import simulate
 
@@ -185,9 +185,9 @@ def test_the_reserve_bounds_what_a_vehicle_leaves_its_reference_by(lag):
 
 def test_points_need_no_reserve():
     """Points that give any force at once leave none, with control that is continuous or sampled."""
-    assert not overshoot_times(points(FLY)).any()
+    assert not tracking_lag_times(points(FLY)).any()
     sampled = {"vehicles": {"x": {"model": "point", "mass": 1.0}}}
-    assert not overshoot_times(
+    assert not tracking_lag_times(
         points(FLY, agents={"vehicle": "x", "position": STANDING}, **sampled)
     ).any()
 

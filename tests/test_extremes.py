@@ -479,7 +479,7 @@ def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, mon
     def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> None:
         extremes.monitor_steps(problem, work, state, last=False)
 
-    monkeypatch.setattr(watching.Extremes, "hand_over", take_here)
+    monkeypatch.setattr(watching.Extremes, "send_steps", take_here)
     for one, other in ((aside, simulate(mission)), (looked, flown())):
         assert [p.extremes for p in one.phases] == [p.extremes for p in other.phases]
         assert (one.position == other.position).all()
@@ -507,7 +507,7 @@ def test_no_step_is_overwritten_before_it_has_been_watched(monkeypatch):
 
     monkeypatch.setattr(watching.Extremes, "monitor_steps", take_slowly)
     aside = flown()
-    monkeypatch.setattr(watching.Extremes, "hand_over", take_here)
+    monkeypatch.setattr(watching.Extremes, "send_steps", take_here)
     assert aside == flown()
 
 

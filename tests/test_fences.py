@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 import rigidfleet as rf
 from rigidfleet.errors import MissionError
 from rigidfleet.math import falls
-from rigidfleet.math.bernstein import greatest_by_measure
+from rigidfleet.math.bernstein import greatest_curve_measure
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import boundaries, fences
 from rigidfleet.mission.geojson import read_geojson
@@ -84,7 +84,7 @@ def test_the_worst_of_a_curve_is_between_no_samples(outside):
             value, bound = region.depths_of_curves(p, outside=outside)
             return value, np.full(len(p), 0.5), bound
 
-        worst = greatest_by_measure(points[None], measure, lambda _: 1e-3)
+        worst = greatest_curve_measure(points[None], measure, lambda _: 1e-3)
         assert dense - 1e-3 <= worst.value <= dense + 1e-3
         place = along(points, np.array([worst.place]))
         assert sign * signed(region, place)[0] == pytest.approx(worst.value, abs=1e-9)
@@ -254,7 +254,7 @@ def test_the_nearest_fall_is_that_of_all_instants_and_heights():
         )
         way = Piecewise(time, pieces)
         watch = boundaries.BoundaryWatch(mission)
-        watch.take_way(way)
+        watch.add_way(way)
         worst = watch.search()["people"]
         t = np.linspace(0, 1, 1000)
         r, v = way.states(t, 2)

@@ -646,7 +646,7 @@ def test_a_reference_lies_on_the_turn_that_is_flown():
     """A command of -170 deg is drawn at 190 deg where 185 deg is flown."""
     flown = np.array([[0.0, 0.0, 185.0], [np.nan] * 3])
     wanted = np.array([[0.0, 0.0, -170.0], [0.0, 0.0, -170.0]])
-    np.testing.assert_allclose(curves._nearest_turn(wanted, flown)[:, 2], [190.0, -170.0])
+    np.testing.assert_allclose(curves._unwrap_near(wanted, flown)[:, 2], [190.0, -170.0])
 
 
 def test_shape_error_is_that_of_the_worst_pair():

@@ -10,8 +10,8 @@ import rigidfleet as rf
 from rigidfleet.foreign.curves import curve_to_rows, least_jerk_curve
 from rigidfleet.kernel.problem import SHAPE, Reference
 from rigidfleet.kernel.references import blend_slots
-from rigidfleet.math.piecewise import Piecewise, join_curves
-from rigidfleet.planning.derivatives import way_series
+from rigidfleet.math.piecewise import Piecewise, stack_ways
+from rigidfleet.planning.derivatives import way_taylor
 
 SLOTS = [[2.0, 0.0, 0.0], [-1.0, 1.7, 0.0], [-1.0, -1.7, 0.0]]
 HEAD = """schema_version = 1
@@ -90,7 +90,7 @@ def test_the_kernel_and_the_plan_evaluate_the_same_ways():
                 for m in range(3):
                     want = told.deriv(m)(inside - knots[k]) if t == inside or not m else 0.0
                     np.testing.assert_allclose(p[m, i, q], want, rtol=1e-12)
-        found = way_series(ref, np.array([t]))[..., 0]
+        found = way_taylor(ref, np.array([t]))[..., 0]
         np.testing.assert_allclose(found[:3], p / np.array([1, 1, 2])[:, None, None], rtol=1e-12)
 
 
@@ -252,7 +252,7 @@ def test_trajectories_are_joined_at_all_knots():
     """Curves with knots of their own agree with themselves at any time, and stay where they end."""
     one = least_jerk_curve(Piecewise(np.array([0.0, 1.0, 3.0]), np.arange(24.0).reshape(2, 4, 3)))
     two = Piecewise(np.array([0.0, 2.0]), np.arange(8.0).reshape(1, 4, 2))
-    knots, pieces = join_curves([one, two])
+    knots, pieces = stack_ways([one, two])
     np.testing.assert_array_equal(knots, [0.0, 1.0, 2.0, 3.0])
     for t in (0.3, 1.7, 2.5):
         k = int(t)

@@ -9,7 +9,7 @@ from sample_missions import three_quadrotors
 import rigidfleet as rf
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import MissionError
-from rigidfleet.solids.distance import in_own_axes, signed_distance
+from rigidfleet.solids.distance import local_point, signed_distance
 
 #: The same level ground at 1 m: everywhere, as terrain, as a roof, and as a roof that is turned.
 LEVEL = {
@@ -40,7 +40,7 @@ def mission(*obstacles, **tables):
 def distance(obstacle, x, y, z):
     """Signed distance [m] from an obstacle to points."""
     solid = mission(obstacle).obstacles[0].solid
-    return signed_distance(*in_own_axes(x, y, z, 0, solid), 0, solid)
+    return signed_distance(*local_point(x, y, z, 0, solid), 0, solid)
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_heights_are_those_of_surfaces(obstacle):
     """A height lies on the surface by the exact distance, with nothing above it; there is none beside a solid."""
     rng = np.random.default_rng(3)
     x, y = rng.uniform(-12.0, 12.0, (2, 300))
-    z = mission(obstacle).height_at(x, y)
+    z = mission(obstacle).height_below(x, y)
     on = np.isfinite(z)
     assert on.any()
     np.testing.assert_allclose(distance(obstacle, x[on], y[on], z[on]), 0.0, atol=1e-9)
@@ -79,11 +79,11 @@ def test_the_highest_below_counts():
         {"kind": "sphere", "centre": [0, 0, 0], "radius": 9.0},
     ]
     over = mission({"kind": "ground", "height": -1.0}, SLOPED, box, *others)
-    assert over.height_at(1.0, 1.0) == 3.0
-    assert over.height_at(1.0, 1.0, 1.5) == pytest.approx(HIGH - np.tan(np.deg2rad(PITCH)))
-    np.testing.assert_array_equal(over.height_at([1.0, 90.0], 1.0), [3.0, -1.0])
-    assert mission(*others).height_at(1.0, 1.0) == -np.inf
-    assert over.height_at(np.zeros((4, 1)), np.zeros(3)).shape == (4, 3)
+    assert over.height_below(1.0, 1.0) == 3.0
+    assert over.height_below(1.0, 1.0, 1.5) == pytest.approx(HIGH - np.tan(np.deg2rad(PITCH)))
+    np.testing.assert_array_equal(over.height_below([1.0, 90.0], 1.0), [3.0, -1.0])
+    assert mission(*others).height_below(1.0, 1.0) == -np.inf
+    assert over.height_below(np.zeros((4, 1)), np.zeros(3)).shape == (4, 3)
 
 
 def flights(obstacles, **tables):
@@ -147,7 +147,7 @@ def test_take_off_and_landing(obstacle):
 def test_take_off_and_landing_on_a_slope():
     """Terrain and a roof of one slope lead to the same flight, up to a level height and down to the slope."""
     x, y = np.array([1.0, 5.0, 4.0]), np.array([6.0, 4.0, 7.0])
-    stands = mission(SLOPED).height_at(x, y) + 0.3
+    stands = mission(SLOPED).height_below(x, y) + 0.3
     agents = {"vehicle": "drone", "position": np.column_stack([x, y, stands]).tolist()}
     phases = [
         {"kind": "takeoff", "height": 3.0, "duration": 5.0},
@@ -157,7 +157,7 @@ def test_take_off_and_landing_on_a_slope():
     terrain, roof = flights([SLOPED, PITCHED], agents=agents, phases=phases)
     np.testing.assert_allclose(roof.position, terrain.position, atol=1e-7)
     end = terrain.position[-1]
-    above = end[:, 2] - mission(SLOPED).height_at(*end[:, :2].T) - terrain.mission.fleet.radius
+    above = end[:, 2] - mission(SLOPED).height_below(*end[:, :2].T) - terrain.mission.fleet.radius
     np.testing.assert_allclose(above, 0.0, atol=0.06)
 
 

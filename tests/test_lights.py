@@ -12,7 +12,7 @@ from sample_flights import WORD, bitmap, swarm, word
 
 from rigidfleet import plotting
 from rigidfleet.interchange import FORMATS, export
-from rigidfleet.result.lights import angles_facing_formation, light_colours, plane_view
+from rigidfleet.result.lights import angles_facing_formation, light_colours, view_angles
 from rigidfleet.web.replay import replay_page
 
 AMBER = np.array([255, 176, 0]) / 255
@@ -97,7 +97,7 @@ UPRIGHT = np.array([[0, 0, 0], [3, 0, 0], [0, 0, 2], [3, 0.2, 2], [1, 0, 1]], dt
 )
 def test_the_viewer_faces_the_plane(points, azimuth, steep):
     """A flat formation is seen along its normal, from the side on which x or y points to the right."""
-    turn, elevation = np.degrees(plane_view(points))
+    turn, elevation = np.degrees(view_angles(points))
     assert turn == pytest.approx(azimuth, abs=3)
     assert elevation == pytest.approx(90) if steep else 0 < elevation < 10
 

@@ -28,7 +28,7 @@ from rigidfleet.result import Result
 from rigidfleet.simulation.flight import StoppedError
 from rigidfleet.web.live import balls, live
 from rigidfleet.web.live import session as sessions
-from rigidfleet.web.live.guarding import with_avoidance
+from rigidfleet.web.live.guarding import with_avoidance_or_reason
 from rigidfleet.web.live.pilot import TICK, Gust, Pilot
 from rigidfleet.web.live.server import Server
 from rigidfleet.web.live.session import Session
@@ -244,7 +244,7 @@ def test_cannot_go_on(monkeypatch):
 
 def settled(**changes) -> Pilot:
     """A pilot with the guard whose triangle hovers."""
-    pilot = Pilot(with_avoidance(mission(**changes))[0])
+    pilot = Pilot(with_avoidance_or_reason(mission(**changes))[0])
     flown(pilot, 7.0)
     return pilot
 
@@ -418,7 +418,7 @@ def test_a_formation_without_room_is_refused():
 
 def test_points_fly_with_the_guard():
     """Live gives points vehicles and [avoidance], so that nothing is met; the text of the mission says it."""
-    flies, why = with_avoidance(TRIANGLE)
+    flies, why = with_avoidance_or_reason(TRIANGLE)
     assert why == ""
     assert flies.avoidance is not None
     assert Mission.from_toml(flies.text).avoidance == flies.avoidance
@@ -449,7 +449,7 @@ def test_points_fly_with_the_guard():
 def test_why_there_is_no_guard(changes, why):
     """Where the guard cannot be had, the mission stays as it is, and the page says why."""
     given = mission(**changes)
-    flies, words = with_avoidance(given)
+    flies, words = with_avoidance_or_reason(given)
     assert flies is given
     assert why in words
     assert why in Session(given).html()
@@ -458,7 +458,7 @@ def test_why_there_is_no_guard(changes, why):
 def test_the_guard_of_the_mission_stays():
     """A mission with [avoidance] of its own is flown as it is."""
     given = load_mission("moving-obstacles")
-    assert with_avoidance(given) == (given, "")
+    assert with_avoidance_or_reason(given) == (given, "")
 
 
 # -- what is kept of a flight

@@ -265,7 +265,7 @@ def lowest(result: Result) -> float:
     """How high above what is below it the surface of a vehicle that is left comes at the least, by samples [m]."""
     r = np.where(result.left[..., None], result.position, 99.0)
     m = result.mission
-    return float((r[..., 2] - m.height_at(*np.moveaxis(r[..., :2], 2, 0)) - RADIUS).min())
+    return float((r[..., 2] - m.height_below(*np.moveaxis(r[..., :2], 2, 0)) - RADIUS).min())
 
 
 PADS = [[x, y, RADIUS] for x, y, _ in START]

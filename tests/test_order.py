@@ -134,7 +134,7 @@ def test_a_path_at_the_clock_s_time_obeys_the_chain_rule(phase):
     clock.advance(0.9)
     leader = led(phase, Detour(), clock)
     h = 0.1
-    problem = leader._moved_problem(5.0, h, np.zeros(7))
+    problem = leader._detour_problem(5.0, h, np.zeros(7))
     times = 5.0 + np.linspace(0.0, h, 5)
     tau = 5.0 - clock.delay + clock.progress_in(times - 5.0)[0]
     wanted = slot_derivatives(leader.problem.reference, leader.problem.motion, tau, 1)[:, 0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BPoly, BSpline, CubicSpline, KroghInterpolator, PPoly
 
-from rigidfleet.math.piecewise import Piecewise, common_knots, join_curves, piece_index
+from rigidfleet.math.piecewise import Piecewise, common_knots, piece_index, stack_ways
 
 RNG = np.random.default_rng(7)
 TIME = 3.0 + np.cumsum(RNG.uniform(0.3, 1.5, 9))
@@ -118,7 +118,7 @@ def test_curves_are_joined_at_all_knots():
     spans = [TIME[:6] + 1e-10, TIME[2:], TIME[[0, 3, 8]]]
     splines = [CubicSpline(t, normal(len(t), 4)) for t in spans]
     curves = [Piecewise(s.x, np.moveaxis(s.c[::-1], 0, -1)) for s in splines]
-    both = join_curves(curves)
+    both = stack_ways(curves)
     assert len(both.time) == len(common_knots(curves)) == len(TIME)
     assert both.pieces.shape == (8, 3, 4, 4)
     for i, (t, spline) in enumerate(zip(spans, splines, strict=True)):
@@ -127,7 +127,7 @@ def test_curves_are_joined_at_all_knots():
     with pytest.raises(
         ValueError, match="3 trajectories with 9 times in all are more than 10 coeff"
     ):
-        join_curves(curves, 10)
+        stack_ways(curves, 10)
 
 
 def test_another_start_fades():

@@ -20,7 +20,7 @@ from rigidfleet.simulation.as_logged import Doubts, judge_log
 from rigidfleet.simulation.flight import simulate
 from rigidfleet.web.replay import replay, replay_page
 from rigidfleet.web.replay.pack import PackedColumn, pack_columns
-from rigidfleet.web.replay.page import bundle_module, page_text
+from rigidfleet.web.replay.page import asset_text, bundle_module
 from rigidfleet.web.replay.scene import thrust_directions
 
 EIGHT = swarm(8, 90.0)
@@ -104,9 +104,9 @@ def test_modules_import_what_there_is():
         "replay/replay.js",
         "live/live.js",
     ):
-        text = page_text(name)
+        text = asset_text(name)
         for names, target in re.findall(r'^import \{([^}]*)\} from "([^"]*)";$', text, re.M):
-            other = page_text(posixpath.normpath(f"{name}/../{target}"))
+            other = asset_text(posixpath.normpath(f"{name}/../{target}"))
             for word in re.findall(r"\w+", names):
                 imports += 1
                 assert re.search(rf"^export .*\b{word}\b", other, re.M), f"{target} has no {word}"

@@ -56,7 +56,7 @@ def flown(reference: Reference, motion: Motion, t: float) -> np.ndarray:
     w = workspace(len(reference.p0), 0)
     references.blend_slots(t, reference, w.p, w.p_dot, w.p_ddot)
     control.reference_motion(t, motion, w)
-    control.desired_agents(w)
+    control.desired_positions(w)
     return np.array([w.r_ref, w.v_ref, w.a_ref])
 
 
@@ -351,7 +351,9 @@ def test_minimum_snap_is_the_spline_of_degree_seven():
     spline = make_interp_spline(t, x, k=7, bc_type=tuple(conditions))
     pieces = splines.minimum_snap(t, x, begin, end)
     for piece, u in ((0, 0.4), (1, 0.3), (2, 1.7), (3, 1.0)):
-        x = series.derivatives(series.of_polynomials(pieces[piece][None], np.array([u]), 7))[:, 0]
+        x = series.derivatives(series.polynomial_series(pieces[piece][None], np.array([u]), 7))[
+            :, 0
+        ]
         for order in range(7):
             expected = spline(t[piece] + u, order)
             np.testing.assert_allclose(x[order], expected, rtol=1e-8, atol=1e-8)

@@ -122,7 +122,7 @@ def test_a_height_map_is_as_far_as_the_nearest_of_its_prisms():
 def test_a_normal_is_the_gradient_and_leads_to_the_surface(name):
     """Against differences of the distance; a step against it, of the distance, ends on the surface."""
     s = records.one_solid(FORMS[name])
-    r = np.array(distance.in_own_axes(*WHERE, 0, s))
+    r = np.array(distance.local_point(*WHERE, 0, s))
     d = np.asarray(distance.signed_distance(*r, 0, s))
     n = np.array(distance.outward_normal(*r, 0, s))
     steps = 1e-6 * np.eye(3)[:, :, None]
@@ -183,7 +183,7 @@ def test_the_kernel_compiles_the_same_distances():
         alone = records.one_solid(form, [1.0, 3.0], [[0, 0, 0], [1, 2, 3]])
         expected = proximity.distances(*where, alone, 2.0)
         own = np.array([obstacles.point_in_solid_axes(*x, 2.0, b, s) for x in where.T])
-        found = [obstacles.tangent_of_solid(*x, b, -1, s)[0] for x in own]
+        found = [obstacles.solid_tangent_plane(*x, b, -1, s)[0] for x in own]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 

@@ -48,7 +48,7 @@ def solver_of(p, edges, masses, law, *, eliminated=False, tolerance=1e-13) -> La
     order = None
     if eliminated:
         steps = solvers.elimination_steps(len(p), edges)
-        order = None if steps is None else ordering.prepare_order(steps, edges)
+        order = None if steps is None else ordering.pivot_order(steps, edges)
     setup = Setup(order, cache(partial(solvers.dissection_order, p, edges)), tolerance)
     return LargeSolver(vehicles, edges.astype(np.uint32), law, work, setup)
 

@@ -32,7 +32,7 @@ from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes, console
 from rigidfleet.errors import MissionError, ResultError, RigidfleetError, SweepError
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.planning.timing import complete_times, expand_mission, matters_to_plan
+from rigidfleet.planning.timing import can_affect_plan, complete_times, expand_mission
 from rigidfleet.result import Extremum
 from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, merge, read
 from rigidfleet.sweep.figures import map_over_two, plot
@@ -351,7 +351,7 @@ def test_what_matters_in_flight_alone_changes_no_way():
         ("constraint", "alpha"),
         *(("disturbances", k) for k in air),
     ]:
-        assert not matters_to_plan(written, keys)
+        assert not can_affect_plan(written, keys)
     assert written.to_dict().keys().isdisjoint(other)
     changed = Mission.from_dict(written.to_dict() | other)
     phases = [expand_mission(mission).to_dict()["phases"] for mission in (written, changed)]
@@ -364,11 +364,11 @@ def test_what_matters_in_flight_alone_changes_no_way():
         "tracking.Q",
         "disturbances.lost",
     ):
-        assert matters_to_plan(written, tuple(path.split(".")))
+        assert can_affect_plan(written, tuple(path.split(".")))
     settling = [{**PAIR["phases"][0], "settle": {}}]
     del settling[0]["until"]
-    assert matters_to_plan(Mission.from_dict(PAIR | {"phases": settling}), ("constraint", "alpha"))
-    assert matters_to_plan(load_mission("passage-quadrotors"), ("constraint", "alpha"))
+    assert can_affect_plan(Mission.from_dict(PAIR | {"phases": settling}), ("constraint", "alpha"))
+    assert can_affect_plan(load_mission("passage-quadrotors"), ("constraint", "alpha"))
 
 
 def test_a_sweep_without_a_way_says_so_in_each_row():

@@ -301,7 +301,7 @@ from pathlib import Path
 import numpy as np
 import rigidfleet as rf
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.math.piecewise import join_curves
+from rigidfleet.math.piecewise import stack_ways
 from rigidfleet.simulation.trajectories import result_of_curve
 from scipy.interpolate import CubicSpline
 rng, t = np.random.default_rng(3), np.arange(480) * 0.1
@@ -309,7 +309,7 @@ curves = []
 for i in range(1000):
     x = [3.0 * (i % 32), 3.0 * (i // 32), 20.0, 0.0] + np.sin(0.3 * t[:, None] + rng.uniform(0, 6, 4)) / 2
     curves.append(Piecewise(t, np.ascontiguousarray(np.moveaxis(CubicSpline(t, x).c[::-1], 0, -1))))
-assert rf.assess(result_of_curve(join_curves(curves), "splines", separation=0.5)).passed
+assert rf.assess(result_of_curve(stack_ways(curves), "splines", separation=0.5)).passed
 print(next(x.split()[1] for x in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in x))
 """
     usual = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}

@@ -371,7 +371,7 @@ def test_points_have_a_path_in_tables_and_no_attitude():
         TickTables(mission, sampled),
         YawTurn(flight.t, np.zeros((2, 8)), np.zeros((2, 8))),
     )
-    tables.start_path(problem, first, sampled.tables)
+    tables.switch_path(problem, first, sampled.tables)
     made = tables.tables_for(first, first + 600, problem, turn)
     assert not any(map(len, (made.yaw, made.jerk, made.snap)))
     w = workspace(8, 0)
@@ -379,10 +379,10 @@ def test_points_have_a_path_in_tables_and_no_attitude():
         t = (first + row) / mission.autopilot.rate
         references.blend_slots(t, problem.reference, w.p, w.p_dot, w.p_ddot)
         control.reference_motion(t, problem.motion, w)
-        control.desired_agents(w)
+        control.desired_positions(w)
         np.testing.assert_allclose(made.path[row], np.hstack([w.r_ref, w.v_ref]), atol=1e-9)
     assert np.ptp(made.path[:, :, 0], axis=0).min() > 0.1  # they move
-    before = tables.start_path(problem, first + 250, made)
+    before = tables.switch_path(problem, first + 250, made)
     assert np.array_equal(before, made.path[250])
 
 

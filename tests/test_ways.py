@@ -398,7 +398,7 @@ def test_a_way_whose_proof_lacks_room_is_looked_for_again_with_more(monkeypatch)
             if i == j:
                 straight = a + np.linspace(0.0, 1.0, 50)[:, None] * (b - a)
                 places = straight[:, None] + roadmap.layers[i].offsets
-                room = min(room, roadmap.space.room_at(places, roadmap.radius).min())
+                room = min(room, roadmap.space.clearance(places, roadmap.radius).min())
         tried.append((roadmap.need, room))
         mission, lacking = try_way(search, roadmap, way)
         return mission, 0.9 if len(tried) == 1 else lacking

@@ -25,7 +25,7 @@ from rigidfleet.kernel.problem import (
 )
 from rigidfleet.kernel.problem import graph as kernel_graph
 from rigidfleet.math.rigid_body import about_cm
-from rigidfleet.planning.reference import align_slots
+from rigidfleet.planning.reference import slot_change
 from rigidfleet.typing import Floats, Ints
 
 
@@ -90,7 +90,7 @@ def constraint_force(
         float(threshold), float(cutoff), 0.0,
     )  # fmt: skip
     a = np.ascontiguousarray(f / m[:, None])
-    constraint.right_side(r, v, _broadcast(integral, (e,), "integral"), a, graph.edges, law, w)
+    constraint.constraint_rhs(r, v, _broadcast(integral, (e,), "integral"), a, graph.edges, law, w)
     if e and not w.L.min() > 0.0:
         i, j = graph.edges[w.L.argmin()]
         raise ValueError(f"agents {i} and {j} coincide: their edge has no direction")
@@ -170,10 +170,10 @@ def shape_schedule(
     m = np.ones(len(p0)) if masses is None else masses
     m, p0 = _check_masses_and_points(m, p0)
     p1 = _broadcast(p1, p0.shape, "p1")
-    dp = align_slots(about_cm(p0, m), about_cm(p1, m), m)[0] if align else p1 - p0
+    dp = slot_change(about_cm(p0, m), about_cm(p1, m), m)[0] if align else p1 - p0
     zero = np.zeros(0)
     ref = Reference(SHAPE, float(start), float(blend), zero, zero, p0, dp, np.zeros(3))
-    return _schedule(ref, _check_edges(edges, len(p0)), times)
+    return _distances_at(ref, _check_edges(edges, len(p0)), times)
 
 
 def distance_schedule(
@@ -187,10 +187,10 @@ def distance_schedule(
     d1 = _broadcast(d1, d0.shape, "d1")
     none = np.zeros((0, 3))
     ref = Reference(SQUARED, float(start), float(blend), d0, d1, none, none, np.zeros(3))
-    return _schedule(ref, np.zeros((len(d0), 2), dtype=np.int64), times)
+    return _distances_at(ref, np.zeros((len(d0), 2), dtype=np.int64), times)
 
 
-def _schedule(ref: Reference, edges: Ints, times: ArrayLike) -> tuple[Floats, Floats, Floats]:
+def _distances_at(ref: Reference, edges: Ints, times: ArrayLike) -> tuple[Floats, Floats, Floats]:
     t = np.atleast_1d(np.asarray(times, dtype=float))
     p = np.zeros((3, *ref.p0.shape))
     out = np.zeros((3, len(t), len(edges)))

@@ -53,7 +53,7 @@ def states_of_motion(
         pieces, h = lqr.quintic_pieces(time, position, velocity, acceleration), np.diff(time)
         x[:-1, 3] = 6.0 * pieces[..., 3]
         before = np.append(np.flatnonzero(h[:-1] > _LONGER * h[1:]), len(h) - 1)
-        ends = series.of_polynomials(pieces[before], h[before], 4)
+        ends = series.polynomial_series(pieces[before], h[before], 4)
         x[before + 1, 3] = 6.0 * ends[3]
     return x
 
@@ -86,10 +86,10 @@ def setpoints_at_rate(samples: Setpoints, rate: float | None) -> Setpoints:
         raise ValueError(
             f"a rate of {rate:g} Hz gives {count * n:,} setpoints; use {fits:.3g} Hz or less"
         )
-    return at_times(samples, np.minimum(time[0] + np.arange(count) / rate, time[-1]))
+    return setpoints_at(samples, np.minimum(time[0] + np.arange(count) / rate, time[-1]))
 
 
-def at_times(samples: Setpoints, wanted: Floats) -> Setpoints:
+def setpoints_at(samples: Setpoints, wanted: Floats) -> Setpoints:
     """Setpoints at increasing times (n,) [s] within the given ones; of two states at a switch, the later one counts."""
     time, count, n = samples.time, len(wanted), samples.yaw.shape[1]
     if len(time) == 1:

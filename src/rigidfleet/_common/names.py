@@ -219,7 +219,7 @@ def meanings_of(names: Sequence[str]) -> list[ColumnMeaning]:
     return [q._replace(kind=up.get(q.kind, q.kind)) for q in kinds]
 
 
-def count_understood(names: Sequence[str]) -> int:
+def count_column_names(names: Sequence[str]) -> int:
     """How many of a line's fields are names of columns; 0 if it has no place and nothing else besides."""
     kinds = [q.kind for q in meanings_of(names) if q.kind]
     places = {*DIRECTIONS, "x", "y", "latitude", "x^0"}

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import AXES, DIRECTIONS, count_understood, meanings_of, unit_of
+from rigidfleet._common.names import AXES, DIRECTIONS, count_column_names, meanings_of, unit_of
 from rigidfleet.typing import Floats, Ints
 
 #: Separators in the order in which they are tried, with their names.
@@ -145,7 +145,7 @@ class TextTable:
             raise fault(f"has units for some columns of {dimension} only: {name!r}", "Give all")
         return known[0][1]
 
-    def find(self, *kinds: str, who: str = "") -> list[int]:
+    def find_columns(self, *kinds: str, who: str = "") -> list[int]:
         """Columns of some quantities; empty unless all are there."""
         columns = [self.places.get((kind, who), -1) for kind in kinds]
         return [] if -1 in columns else columns
@@ -158,7 +158,7 @@ class TextTable:
         ContentError
             Names of directions contradict the axes.
         """
-        if place := self.find(*"xyz", who=who):
+        if place := self.find_columns(*"xyz", who=who):
             return place, axes or "enu"
         ways = [kind for kind, own in self.places if kind in DIRECTIONS and own == who]
         named = "".join(DIRECTIONS[way] for way in ways)
@@ -166,13 +166,13 @@ class TextTable:
             return [], axes or "enu"
         if sorted(axes or named) != sorted(named):
             raise fault(f"has columns {', '.join(ways)}, but the axes are {axes}", "Remove one")
-        return self.find(*ways, who=who), named
+        return self.find_columns(*ways, who=who), named
 
     def missing_columns_error(self, *kinds: str) -> ContentError:
         """The error of a table without some quantities."""
-        if self.find("latitude"):
+        if self.find_columns("latitude"):
             return fault("has latitude and longitude", "Give metres from an origin: x_m, y_m, z_m")
-        missing = ", ".join(kind for kind in kinds if not self.find(kind))
+        missing = ", ".join(kind for kind in kinds if not self.find_columns(kind))
         why = f"has no column for {missing} among {', '.join(self.names)[:80]}"
         return fault(why, "Name columns x_m, y_m and z_m, and time_s for trajectories")
 
@@ -295,7 +295,7 @@ def _find_header(texts: list[str]) -> tuple[int, int, list[str], list[str], str,
     most = {k: max((sum(map(is_number, x)), len(x)) for x in fields) for k, fields in split.items()}
     rows = {k: count for k, (count, _) in most.items() if count > 1}
     plain = [k for k in rows if texts[k][0] != "#"]
-    start, names, own = _find_heads(texts, [k for k in head if 2 * most[k][0] <= most[k][1]], plain)
+    start, names, own = _find_names(texts, [k for k in head if 2 * most[k][0] <= most[k][1]], plain)
     if not names:
         # Before rows without names, a line that begins with # may be one of them.
         start = min(rows, default=len(texts))
@@ -320,7 +320,7 @@ def _find_header(texts: list[str]) -> tuple[int, int, list[str], list[str], str,
     return line, start, names, units, separator, width
 
 
-def _find_heads(texts: list[str], head: list[int], rows: list[int]) -> tuple[int, list[str], str]:
+def _find_names(texts: list[str], head: list[int], rows: list[int]) -> tuple[int, list[str], str]:
     """Line, from 1, names and separator: of the lines before the first row below names, the one understood best."""
     best, names = (False, 0.0), (0, [], "")
     for k in head:
@@ -333,7 +333,7 @@ def _find_heads(texts: list[str], head: list[int], rows: list[int]) -> tuple[int
             fields, whole = split_fields(line, separator), split_fields(f"{line}.", separator)
             if len(whole) > len(fields) and len(whole) in counts:
                 fields.append("")  # a last column without a name
-            score = len(fields) in counts, count_understood(fields) / max(1, len(fields))
+            score = len(fields) in counts, count_column_names(fields) / max(1, len(fields))
             if score[1] > 0.0 and score >= best:
                 best, names = score, (k + 1, fields, separator)
     return names
@@ -369,7 +369,7 @@ def _read_rows(
             rows = []
             for k, fields in enumerate(block, first):
                 plain = len(fields) == width and fields and fields[0] and fields[0][0] != "#"
-                row = fields if plain else _fields_of_row(texts[k - 1], fields, width, separator)
+                row = fields if plain else _odd_row_fields(texts[k - 1], fields, width, separator)
                 if row and len(row) == width:
                     numbers.append(k)
                     rows.append(row)
@@ -384,7 +384,7 @@ def _read_rows(
     return np.array(numbers, dtype=np.int64), columns, faults
 
 
-def _fields_of_row(line: str, fields: list[str], width: int, separator: str) -> list[str]:
+def _odd_row_fields(line: str, fields: list[str], width: int, separator: str) -> list[str]:
     """The fields of a row that is not like the others; none of an empty line and a comment.
 
     A line that begins with # is a row if it has as many fields as one, or numbers alone behind its first field.

@@ -86,30 +86,30 @@ class DrawnWays:
         if name in _AT_END:
             k = int(np.abs(self.result.time - (check.when or 0.0)).argmin())
             if name not in _SHAPES:
-                return _greatest_norm(shifts[:, order, k])
+                return _estimate_greatest_norm(shifts[:, order, k])
             i, j = proximity.all_pairs(self.result.n_agents)
-            by = _greatest_norm(shifts[:, 0, k, i] - shifts[:, 0, k, j])
+            by = _estimate_greatest_norm(shifts[:, 0, k, i] - shifts[:, 0, k, j])
             least = float(_norms(self.result.position[k, i] - self.result.position[k, j]).min())
             if check.worst is None:  # what is lost where vehicles may change places
                 return by if by > 0.5 * least else 0.0
             return math.degrees(math.atan2(by, least)) if check.unit == "deg" else by
         sizes = _norms(shifts[:, order])
-        most = _greatest(sizes)
+        most = _estimate_greatest(sizes)
         if q.name in ("separation", "separation_flying"):
             k, i, j = self._near_pairs(float(check.worst or 0.0) + 4.0 * most)
-            return _greatest_norm(shifts[:, 0, k, i] - shifts[:, 0, k, j])
+            return _estimate_greatest_norm(shifts[:, 0, k, i] - shifts[:, 0, k, j])
         if _is_of_pairs(name):
             return 2.0 * most
         if name == "people":  # where one falls depends on its velocity, for the time of a fall
             height, gravity = np.ptp(self.result.position[..., 2]), self.result.mission.gravity
-            return most + math.sqrt(2.0 * height / gravity) * _greatest_norm(shifts[:, 1])
+            return most + math.sqrt(2.0 * height / gravity) * _estimate_greatest_norm(shifts[:, 1])
         values = -self.likely_measurements.closeness.each if name == "clearance" else None
         if name in SAMPLED and q.who == "agent":
             values = self.likely_measurements.samples_of(name).rank
         if values is None or values.shape != sizes.shape[1:]:
             return most
         # Only what is near the worst value may be the worst in truth.
-        return _greatest(sizes[:, values >= q.rank(check.worst) - 2.0 * most])
+        return _estimate_greatest(sizes[:, values >= q.rank(check.worst) - 2.0 * most])
 
     def _near_pairs(self, reach: float) -> tuple[Ints, Ints, Ints]:
         """Samples and pairs whose surfaces are nearer than a distance: the nearest ones, if they are many."""
@@ -128,11 +128,11 @@ def _norms(x: Floats) -> Floats:
     return np.sqrt(np.einsum("...a,...a->...", x, x))
 
 
-def _greatest_norm(x: Floats) -> float:
-    return _greatest(_norms(x))
+def _estimate_greatest_norm(x: Floats) -> float:
+    return _estimate_greatest(_norms(x))
 
 
-def _greatest(sizes: Floats) -> float:
+def _estimate_greatest(sizes: Floats) -> float:
     """How great lengths (S, ...) of deviations of S ways drawn may be: so few ways alone do not reach what is rare."""
     squares = float(np.einsum("s...,s...->...", sizes, sizes).max(initial=0.0))
     return max(float(sizes.max(initial=0.0)), _SURE * math.sqrt(squares / (3 * len(sizes))))
@@ -281,9 +281,9 @@ def doubt_notes(facts: dict[str, Any]) -> Iterator[str]:
     turn, scale = explained["turn_deg"], explained["scale"]
     parts = []
     if turn and abs(turn[0]) > _SURE * turn[1]:
-        parts.append(f"turned by {_with_error(*turn)} deg about the vertical")
+        parts.append(f"turned by {_plus_minus(*turn)} deg about the vertical")
     if scale and abs(scale[0] - 1.0) > _SURE * scale[1]:
-        parts.append(f"scaled by {_with_error(*scale)}")
+        parts.append(f"scaled by {_plus_minus(*scale)}")
     if any(x and abs(x[0]) > max(_SURE * x[1], _OFF) for x in explained["shift_m"]):
         parts.append(f"shifted by ({', '.join(value(x[0]) for x in explained['shift_m'])}) m")
     if parts:
@@ -304,16 +304,16 @@ def doubt_notes(facts: dict[str, Any]) -> Iterator[str]:
             off, by = 1e3 * each["mean_off_m"], 1e3 * np.nan_to_num(each["mean_error_m"])
             x, y, z = (value(1e3 * x) for x in each["mean_off_xyz_m"])
             peak = f"{value(1e3 * each['worst_off_m'], 'mm')} at {each['worst_at_s']:.2f} s"
-            yield f"{each['name']!r} is {_with_error(off, by)} mm off its slot on average, ({x}, {y}, {z}), and {peak}"
+            yield f"{each['name']!r} is {_plus_minus(off, by)} mm off its slot on average, ({x}, {y}, {z}), and {peak}"
         if each["late"] and facts["clock"] != "own":  # then all are told at once
             yield f"{each['name']!r} is {_lateness_in_words(*each['offset_s'])} by itself: its clock, or its tracking"
 
 
 def _lateness_in_words(offset: float, error: float) -> str:
-    return f"{_with_error(abs(offset), error)} s {'late' if offset >= 0.0 else 'early'}"
+    return f"{_plus_minus(abs(offset), error)} s {'late' if offset >= 0.0 else 'early'}"
 
 
-def _with_error(x: float, error: float) -> str:
+def _plus_minus(x: float, error: float) -> str:
     """A value with its error, to the digits that the error has."""
     digits = max(0, 1 - math.floor(math.log10(error))) if error > 0.0 else 2
     return f"{x:.{digits}f} +- {error:.{digits}f}"

@@ -126,7 +126,7 @@ def _fall_notes(measured: Measurements) -> Iterator[str]:
     for i in np.flatnonzero(~measured.left[-1] & (measured.mission.lost_at < np.inf)):
         r = measured.result.position[:, i]
         words = f"agent {i + 1}, lost at {measured.mission.lost_at[i]:.2f} s,"
-        down = ~measured.left[:, i] & (r[:, 2] <= measured.mission.height_at(*r.T) + radius[i])
+        down = ~measured.left[:, i] & (r[:, 2] <= measured.mission.height_below(*r.T) + radius[i])
         if down.any():
             x, y, _ = r[-1]
             yield f"{words} hits the ground at {measured.first_time(down):.2f} s and lies at ({x:z.1f}, {y:z.1f}) m"

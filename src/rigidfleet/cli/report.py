@@ -175,7 +175,7 @@ def _drill_sentences(folder: Path, mission: Mission) -> list[str]:
         )
     if own.digest != mission.digest:  # a result has the ways that were planned for its mission
         _refuse_other_mission(path, expand_mission(own).digest, mission)
-    return [*outcome.drill_sentences(), _name_and_digest(path)]
+    return [*outcome.drill_sentences(), _name_and_digest_text(path)]
 
 
 def _abort_sentences(folder: Path, mission: Mission) -> list[str]:
@@ -220,7 +220,7 @@ def _abort_sentences(folder: Path, mission: Mission) -> list[str]:
         lines.append(
             f"If one does not hear: agent {i} flies on and {near} agent {j} at {worst['time_s']:.1f} s."
         )
-    return [*lines, _name_and_digest(path)]
+    return [*lines, _name_and_digest_text(path)]
 
 
 def _refuse_other_mission(path: Path, digest: str, mission: Mission) -> None:
@@ -231,7 +231,7 @@ def _refuse_other_mission(path: Path, digest: str, mission: Mission) -> None:
         )
 
 
-def _name_and_digest(path: Path) -> str:
+def _name_and_digest_text(path: Path) -> str:
     return f"{path.name}, SHA-256 {sha256(path.read_bytes()).hexdigest()}"
 
 

@@ -131,7 +131,7 @@ def parse_table(data: bytes, words: Units) -> tuple[TextTable, list[str]]:
 
 def _times_and_epoch(table: TextTable, notes: list[str]) -> tuple[Floats, int | None]:
     """Times (K,) [s], and the nanoseconds since 1970 from which they count; None if they are no dates."""
-    if not (columns := table.find("time")):
+    if not (columns := table.find_columns("time")):
         raise table.missing_columns_error("time")
     fields = table.columns[columns[0]].tolist() or [""]
     number = is_number(fields[0])
@@ -222,7 +222,7 @@ def read_tracks(
     named = table.kinds[main.place[0]].kind in DIRECTIONS
     said = "the option" if axes else "the file" if named else ""
     notes += _doubts_about_units(table, tracks, axes=bool(said))
-    used = {*columns, *table.find("time"), *identity}
+    used = {*columns, *table.find_columns("time"), *identity}
     return tracks, {
         "rows": len(time), "names_in_line": table.line, "separator": SEPARATORS[table.separator],
         "decimal_mark": table.decimal or ".",
@@ -248,7 +248,9 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
         place, turned = table.position_columns(axes, who)
         kinds = ("vx", "vy", "vz"), ("yaw",), ("qx", "qy", "qz", "qw")
         if place:
-            sets[who] = _Places(turned, place, *(table.find(*kind, who=who) for kind in kinds))
+            sets[who] = _Places(
+                turned, place, *(table.find_columns(*kind, who=who) for kind in kinds)
+            )
         if own := {kind: k for (kind, x), k in table.places.items() if x == who and kind in "xyz"}:
             loose[who] = own
     flown = {who: own for who, own in sets.items() if who not in ROLES} or sets
@@ -304,9 +306,9 @@ def _rows_of_vehicles(
         elif len(labels) > 1 and (kinds[k] == "agent" or _FLAGS.search(names[k])):
             notes.append(f"the column {names[k]!r} is not read: rows count whatever it says")
     chosen = next(([k] for k in named if _time_increases(time, coded[k][0])), named)
-    part = _joint_codes(part, *(coded[k][0] for k in chosen))
+    part = _combined_codes(part, *(coded[k][0] for k in chosen))
     few = [k for k in coded if k not in named and 1 < len(coded[k][1]) <= n / 2]
-    others = {k: _joint_codes(part, coded[k][0]) for k in few}
+    others = {k: _combined_codes(part, coded[k][0]) for k in few}
     others = {k: both for k, both in others.items() if _ROWS * (both.max() + 1) <= n}
     if unclear := not _time_increases(time, part):
         apart = {k: both for k, both in others.items() if _time_increases(time, both)}
@@ -326,7 +328,7 @@ def _rows_of_vehicles(
         chosen, part = [*chosen, k], apart[k]
         notes.append(f"the column {names[k]!r} is taken for names of vehicles: its rows lie apart")
     for k in named:
-        if _joint_codes(part, coded[k][0]).max() > part.max():
+        if _combined_codes(part, coded[k][0]).max() > part.max():
             notes.append(f"the column {names[k]!r} may name vehicles, too, and is not read")
     groups = {}
     for rows in np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part))[:-1]):
@@ -339,7 +341,7 @@ def _rows_of_vehicles(
     return groups, chosen
 
 
-def _joint_codes(*codes: Ints) -> Ints:
+def _combined_codes(*codes: Ints) -> Ints:
     """Codes of the combinations of codes, in the order of their first rows."""
     whole = codes[0]
     for code in codes[1:]:

@@ -410,7 +410,7 @@ def _resets(columns: dict[str, Any], time: Floats, place: Floats, velocity: Floa
     return np.flatnonzero(far > max(_JUMP, _UNUSUAL * float(np.median(far)))) + 1
 
 
-def _geodetic_place(columns: dict[str, Any], names: str, units: Any = 1.0) -> Geodetic | None:
+def _last_geodetic(columns: dict[str, Any], names: str, units: Any = 1.0) -> Geodetic | None:
     """The latest place on the Earth that fields tell, if there is one."""
     if not {*names.split()} <= columns.keys():
         return None
@@ -451,7 +451,7 @@ def channel_of_px4(topic: str, name: str, data: dict[str, Any], after: int = 0) 
     for field, ned in (("pose_frame", 1), ("local_frame", 0)):
         if field in data:
             data["is_ned"] = data[field] == ned
-    return Channel(topic, name, data, "", _geodetic_place(data, "ref_lat ref_lon ref_alt"))
+    return Channel(topic, name, data, "", _last_geodetic(data, "ref_lat ref_lon ref_alt"))
 
 
 def _collect_columns(log: Any) -> dict[tuple[int, str, int], dict[str, Any]]:
@@ -505,7 +505,7 @@ def _read_bin(path: Path) -> Log:
     beside = {kind: columns for (_, kind, _), columns in table.items() if kind in _BESIDE}
     channels, dated, place = [], False, None
     if own := beside.get("ORGN"):  # type 0 is the origin of the filter
-        place = _geodetic_place({k: x[own["Type"] == 0] for k, x in own.items()}, "Lat Lng Alt")
+        place = _last_geodetic({k: x[own["Type"] == 0] for k, x in own.items()}, "Lat Lng Alt")
     for (_, kind, lane), columns in table.items():
         if kind in _BESIDE:
             continue
@@ -530,7 +530,7 @@ def _read_tlog(path: Path) -> Log:
     for (who, kind, lane), columns in sorted(table.items(), key=lambda each: each[0][2]):
         if kind not in _BESIDE:
             own = table.get((who, "GPS_GLOBAL_ORIGIN", 0), {})
-            place, frame = _geodetic_place(own, _BESIDE["GPS_GLOBAL_ORIGIN"], _INTEGERS[:3]), ""
+            place, frame = _last_geodetic(own, _BESIDE["GPS_GLOBAL_ORIGIN"], _INTEGERS[:3]), ""
             if "frame_id" in columns:
                 frame = _FRAMES.get(int(columns["frame_id"][0]), "")
                 columns["is_ned"] = (columns["frame_id"] == columns["frame_id"][0]) & bool(frame)

@@ -33,7 +33,7 @@ def read_text_table(data: bytes, stem: str, interpolation: str, units: Units) ->
         The table cannot be read, or a time does not increase.
     """
     table, notes = parse_table(data, units)
-    if table.find("duration", "x^0"):
+    if table.find_columns("duration", "x^0"):
         for k, q in enumerate(table.kinds):
             labels = table.codes(k)[1] if q.kind in ("agent", "thing") else []
             counts = q.kind == "thing" and are_row_numbers(labels, len(table.lines))
@@ -70,10 +70,10 @@ def _curve_of_coefficients(table: TextTable) -> Piecewise:
         A column is missing, or a duration is not positive.
     """
     due = ["duration", *(f"{axis}^{k}" for axis in NAMES for k in range(POWERS))]
-    if missing := [kind for kind in due if not table.find(kind)]:
+    if missing := [kind for kind in due if not table.find_columns(kind)]:
         remedy = "A table of polynomials has the columns duration, x^0 to x^7, y^0, z^0 and yaw^0 to yaw^7"
         raise fault(f"has no column, or two, for {missing[0]}", remedy, table.line)
-    rows = table.numbers_of_columns(table.find(*due))
+    rows = table.numbers_of_columns(table.find_columns(*due))
     bad = np.flatnonzero(~(rows[:, 0] > 0.0))
     if len(bad):
         why = f"the duration is {rows[bad[0], 0]:g} s"
@@ -90,7 +90,7 @@ def read_result_table(data: bytes) -> list[Piecewise]:
     """The curves in a table of `Result.to_csv`: polynomials of degree 7 (yaw: 3) that meet all that it says."""
     axes = [f"{kind}{axis}" for kind in ("", "v", "a", "j") for axis in "xyz"]
     table = TextTable(data, {})
-    every = table.numbers_of_columns(table.find("time", *axes, "yaw", "yaw_rate"))
+    every = table.numbers_of_columns(table.find_columns("time", *axes, "yaw", "yaw_rate"))
     code, labels = table.codes(table.names.index("agent"))
     curves = []
     for agent in sorted(range(len(labels)), key=lambda k: int(labels[k])):

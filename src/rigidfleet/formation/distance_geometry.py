@@ -141,10 +141,10 @@ def slots_from_distances(n: int, edges: ArrayLike, lengths: ArrayLike) -> Floats
         raise ValueError(
             f"no points in space have these distances (the nearest realisable set is {error:.3g} m off)"
         )
-    return _turn_to_convention(p)
+    return _turn_to_slot_convention(p)
 
 
-def _turn_to_convention(p: Floats) -> Floats:
+def _turn_to_slot_convention(p: Floats) -> Floats:
     """Turn and mirror centred points (N, 3) to the convention of `slots_from_distances`."""
     x = _first_direction(p[::-1], p)
     if x is None:

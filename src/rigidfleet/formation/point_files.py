@@ -169,13 +169,13 @@ def _read_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tupl
         remedy = "if commas are decimal marks, separate numbers by semicolons"
         raise fault("has numbers such as 00", remedy)
     columns, axes = table.position_columns()
-    if not (columns := columns or table.find("x", "y")):
+    if not (columns := columns or table.find_columns("x", "y")):
         raise table.missing_columns_error("x", "y")
-    if (time := table.find("time")) and len(table.codes(time[0])[1]) > 1:
+    if (time := table.find_columns("time")) and len(table.codes(time[0])[1]) > 1:
         remedy = "keep the rows of one, or fly it as a trajectory"
         raise fault("has points of several times", remedy)
-    written, n = table.find("colour"), len(columns)
-    hues = table.find(*_HUES) if not written else []
+    written, n = table.find_columns("colour"), len(columns)
+    hues = table.find_columns(*_HUES) if not written else []
     values = table.numbers_of_columns(columns + hues)
     if table.decimal == "," and not table.named:
         notes.append("commas are read as decimal marks")

@@ -175,7 +175,7 @@ def heading_knots(curve: Piecewise) -> tuple[Floats, Floats]:
     k = np.repeat(np.arange(len(step)), counts + 1)
     along = np.arange(len(k)) - (np.cumsum(counts + 1) - counts - 1)[k]
     after = along / counts[k] * step[k]
-    times, yaws = curve.time[k] + after, series.of_polynomials(yaw[k], after, 1)[0]
+    times, yaws = curve.time[k] + after, series.polynomial_series(yaw[k], after, 1)[0]
     again = np.append(False, np.diff(times) < 1e-9)
     times[again] += 1e-3
     needed = ~again | np.append(False, abs(np.diff(yaws)) > 1e-9)

@@ -15,7 +15,7 @@ import numpy as np
 from rigidfleet.foreign.curves import curve_through_states
 from rigidfleet.interchange.curves import ExportedMotion
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.setpoints import at_times
+from rigidfleet.setpoints import setpoints_at
 from rigidfleet.typing import Floats
 
 #: SET_POSITION_TARGET_LOCAL_NED: number, extra byte of the checksum, and fields in the order of the wire.
@@ -51,7 +51,7 @@ def write_tlog(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     for agent in range(motion.n_agents):
         alone = motion.of_vehicle(agent)
         wanted = np.unique(np.round((alone.at_rate(rate).time - motion.start) * 1e3))
-        setpoints = at_times(alone.samples, np.minimum(wanted / 1e3 + motion.start, motion.end))
+        setpoints = setpoints_at(alone.samples, np.minimum(wanted / 1e3 + motion.start, motion.end))
         every = np.round((setpoints.time - motion.start) * 1e3).astype(np.int64)
         off = 1e3 * (float(motion.result.motors_off[agent]) - motion.start)
         flies, system = every <= off, agent % _SYSTEMS + 1

@@ -31,7 +31,7 @@ from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.constraint import find_multipliers
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve
 from rigidfleet.kernel.moving import relative_braking_limit
-from rigidfleet.kernel.segments import point_to_obstacle, segment_to_obstacle
+from rigidfleet.kernel.segments import obstacle_distance, segment_obstacle_distance
 
 #: Greatest number of sweeps, change of an acceleration that ends them [m/s^2].
 _SWEEPS, _CLOSE = 10, 5e-5
@@ -99,7 +99,7 @@ def add_obstacle_barrier(count, i, entry, needed, a):
 
 
 @jit
-def needed_acceleration_beside(i, o, r, v, a):
+def least_passing_acceleration(i, o, r, v, a):
     """Least acceleration of vehicle i with which obstacle o, which moves, passes it; ``normal`` is its direction.
 
     Both go on straight to where they are nearest, in the time t, with a part of the distance to keep missing. An
@@ -113,9 +113,9 @@ def needed_acceleration_beside(i, o, r, v, a):
         q[k] = p[k] + _AHEAD * (v[k] - x[3 + k])
     keep = a.reach[i] + a.spare[i] + bound[0]
     most = keep + _AHEAD * bound[1]
-    if segment_to_obstacle(p, q, o, a.solids, most, a.normal)[1] >= most:  # quick
+    if segment_obstacle_distance(p, q, o, a.solids, most, a.normal)[1] >= most:  # quick
         return -math.inf
-    _, away, share = segment_to_obstacle(p, q, o, a.solids, math.nan, a.normal)
+    _, away, share = segment_obstacle_distance(p, q, o, a.solids, math.nan, a.normal)
     t = _AHEAD * share
     missing = keep + t * bound[1] - away
     along = fast = 0.0
@@ -162,14 +162,14 @@ def list_barriers(r, v, lost, a):
         for o in range(a.solids.kind.shape[0]):
             B = a.b[i]
             if a.sight.moves[o] == 0:
-                away = point_to_obstacle(r[i, 0], r[i, 1], r[i, 2], o, a.solids, n)
+                away = obstacle_distance(r[i, 0], r[i, 1], r[i, 2], o, a.solids, n)
                 gap = away - a.reach[i] - a.spare[i]
                 s = n[0] * v[i, 0] + n[1] * v[i, 1] + n[2] * v[i, 2]
             elif a.sight.known[o] == KNOWN:
                 x, bound, B = a.sight.track[o], a.sight.bound[o], relative_braking_limit(i, o, a)
                 for q in range(3):
                     n[q] = r[i, q] - x[q] - a.lead[i, q] * x[3 + q]
-                away = point_to_obstacle(n[0], n[1], n[2], o, a.solids, n)
+                away = obstacle_distance(n[0], n[1], n[2], o, a.solids, n)
                 gap = away - a.reach[i] - a.spare[i] - bound[0]
                 s = n[0] * (v[i, 0] - x[3]) + n[1] * (v[i, 1] - x[4]) + n[2] * (v[i, 2] - x[5])
                 s -= bound[1]
@@ -185,7 +185,7 @@ def list_barriers(r, v, lost, a):
             count, worse = add_obstacle_barrier(count, i, entry, needed, a)
             violated = violated or worse
             if a.sight.moves[o] != 0:
-                needed = needed_acceleration_beside(i, o, r[i], v[i], a)
+                needed = least_passing_acceleration(i, o, r[i], v[i], a)
                 count, worse = add_obstacle_barrier(count, i, entry + 1, needed, a)
                 violated = violated or worse
     return count, violated

@@ -157,7 +157,7 @@ def least_norm_of_curve(curve, floor, work, pieces):
     are examined again once their least length is roughly known.
     """
     best, at, top, count = floor, -1.0, 0, 0
-    stack_curve(curve, pieces)
+    start_piece_stack(curve, pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
         middle, along, size = 0.0, math.inf, 0.0
@@ -193,7 +193,7 @@ def least_norm_of_curve(curve, floor, work, pieces):
 
 
 @jit
-def distance_beyond_plane(piece, distance, x, y, z):
+def distance_bound_by_plane(piece, distance, x, y, z):
     """Lower bound of the distance between a curve with control points (15,) and something convex.
 
     The tangent plane at the nearest point to any point bounds it; the middle control point is near the curve. The plane
@@ -216,7 +216,7 @@ def tangent_of_box(x, y, z, b, _, boxes):
 
 
 @jit
-def refine_top_piece(bound, best, at, close, count, top, pieces):
+def halve_or_prune_piece(bound, best, at, close, count, top, pieces):
     """Halve the piece on top of the stack if its lower bound may be below the best value, else drop it.
 
     After `_MOST` pieces, the bound itself is taken. Returns the best value, its place, and the new top.
@@ -232,7 +232,7 @@ def refine_top_piece(bound, best, at, close, count, top, pieces):
 
 
 @jit
-def stack_curve(curve, pieces):
+def start_piece_stack(curve, pieces):
     """Put a curve with control points (5, 3) on an empty stack; returns the accuracy that its rounding allows [m]."""
     close = CLOSE
     for k in range(5):
@@ -249,11 +249,11 @@ def distance_to_box(curve, b, part, floor, pieces, boxes):
 
     `obstacles` makes of this source the same for any solid, or a ``part`` of one, by another `tangent_of_box`.
     """
-    best, at, top, count, close = floor, -1.0, 0, 0, stack_curve(curve, pieces)
+    best, at, top, count, close = floor, -1.0, 0, 0, start_piece_stack(curve, pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
         distance, x, y, z = tangent_of_box(piece[6], piece[7], piece[8], b, part, boxes)
-        bound = distance_beyond_plane(piece, distance, x, y, z)
+        bound = distance_bound_by_plane(piece, distance, x, y, z)
         if bound < best - close:
             for k in (0, 12):
                 distance, _, _, _ = tangent_of_box(
@@ -261,14 +261,14 @@ def distance_to_box(curve, b, part, floor, pieces, boxes):
                 )
                 if distance < best:
                     best, at = distance, piece[15] + (piece[16] if k == 12 else 0.0)
-        best, at, top = refine_top_piece(bound, best, at, close, count, top, pieces)
+        best, at, top = halve_or_prune_piece(bound, best, at, close, count, top, pieces)
     return best, at
 
 
 @jit
 def least_height_in_cylinder(points, reach, floor, pieces):
     """Least |z| of a curve with control points (5, 3) while within ``reach`` of the z axis, and its place."""
-    best, at, top, count, close = floor, -1.0, 0, 0, stack_curve(points, pieces)
+    best, at, top, count, close = floor, -1.0, 0, 0, start_piece_stack(points, pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
         for k in (0, 4):
@@ -294,9 +294,9 @@ def least_height_in_cylinder(points, reach, floor, pieces):
 
 
 @jit
-def least_norm(curve, own, other, altitude, floor, pieces):
+def least_norm_above(curve, own, other, altitude, floor, pieces):
     """Least |r| of a curve with control points (5, 3) while one of two others is at z >= ``altitude``; its place."""
-    best, at, top, count, close, rate = floor, -1.0, 0, 0, stack_curve(curve, pieces), 0.0
+    best, at, top, count, close, rate = floor, -1.0, 0, 0, start_piece_stack(curve, pieces), 0.0
     for k in range(1, 5):
         rate = max(rate, abs(own[k, 2] - own[k - 1, 2]), abs(other[k, 2] - other[k - 1, 2]))
     while top >= 0:
@@ -316,11 +316,11 @@ def least_norm(curve, own, other, altitude, floor, pieces):
         bound = max(along / middle, 0.0) if middle > 0.0 else 0.0
         if high + 2.0 * rate * piece[16] < altitude:
             bound = math.inf
-        best, at, top = refine_top_piece(bound, best, at, close, count, top, pieces)
+        best, at, top = halve_or_prune_piece(bound, best, at, close, count, top, pieces)
     return best, at
 
 
 @jit
-def write_bernstein(x, out):
+def write_bernstein_basis(x, out):
     """Write the Bernstein polynomials (5,) of fourth degree at x."""
     out[0], out[1], out[2], out[3], out[4] = bernstein_at(x)

@@ -25,7 +25,7 @@ def elimination_tree(first, left, parent, ancestor):
 
 
 @jit
-def count_blocks(first, left, parent, mark, count, most):
+def count_factor_blocks(first, left, parent, mark, count, most):
     """Add the blocks below the diagonal to each column's count (N,); return False for more than ``most`` in all."""
     total = 0
     for k in range(parent.shape[0]):
@@ -43,8 +43,8 @@ def count_blocks(first, left, parent, mark, count, most):
 
 
 @jit
-def fill_blocks(first, left, parent, mark, free, out):
-    """Write the rows and columns of the blocks counted by `count_blocks`."""
+def list_factor_blocks(first, left, parent, mark, free, out):
+    """Write the rows and columns of the blocks counted by `count_factor_blocks`."""
     at = 0
     for k in range(parent.shape[0]):
         mark[k] = k

@@ -49,11 +49,11 @@ from rigidfleet.kernel.rigid_body import attitude_matrix
 from rigidfleet.kernel.sampled_flight import write_measured_states
 from rigidfleet.kernel.segments import (
     hull_distance,
-    least_along,
-    point_to_obstacle,
-    refined_segment_to_obstacle,
+    obstacle_distance,
+    parabola_min,
+    refined_obstacle_distance,
     segment_distance,
-    segment_to_obstacle,
+    segment_obstacle_distance,
 )
 
 #: Neighbours are listed for speeds higher by this share and summand [m/s], and for ways of this share of their
@@ -150,7 +150,7 @@ def is_apart(i, v, j, s, floor, a):
     theirs = n0 * rise[0] + n1 * rise[1] + n2 * rise[2]
     # Drag lets accelerations decay during the tick
     least = min(own, own * a.coast[i, 0]) - max(theirs, theirs * a.coast[j, 0])
-    return least_along(along, rate, least, a.period) >= floor
+    return parabola_min(along, rate, least, a.period) >= floor
 
 
 @jit
@@ -162,14 +162,14 @@ def keeps_clearance(i, v, far, a):
             continue
         floor = a.walls[i, o]
         # Farther away than it can come: most obstacles take one distance.
-        if point_to_obstacle(way[0, 0], way[0, 1], way[0, 2], o, a.solids, normal) - far >= floor:
+        if obstacle_distance(way[0, 0], way[0, 1], way[0, 2], o, a.solids, normal) - far >= floor:
             continue
         # Its stop segment after the tick, then its path over the tick as in `is_apart`: a parabola beyond the chord.
         after = a.ways[i, 4] if a.soft[i] > 0.0 else way[1]
-        bound, _, _ = segment_to_obstacle(after, way[2], o, a.solids, floor, normal)
+        bound, _, _ = segment_obstacle_distance(after, way[2], o, a.solids, floor, normal)
         if bound < floor:
             return False
-        bound, value, x = segment_to_obstacle(way[0], way[1], o, a.solids, floor, normal)
+        bound, value, x = segment_obstacle_distance(way[0], way[1], o, a.solids, floor, normal)
         if bound < floor:
             return False
         along = rate = rise = 0.0
@@ -178,7 +178,7 @@ def keeps_clearance(i, v, far, a):
             rate += normal[q] * v[q]
             rise += normal[q] * way[4, q]
         rise = min(rise, rise * a.coast[i, 0])
-        if least_along(value - x * along, rate, rise, a.period) < floor:
+        if parabola_min(value - x * along, rate, rise, a.period) < floor:
             return False
     return True
 
@@ -260,7 +260,7 @@ def list_neighbours(r, lost, way, a):
 
 
 @jit
-def greatest_length(x):
+def greatest_row_norm(x):
     """Greatest length of the rows of x (N, 3)."""
     longest = 0.0
     for i in range(x.shape[0]):
@@ -289,7 +289,7 @@ def greatest_relative_move(r, a):
 @jit
 def update_neighbours(r, v, lost, a):
     """Renew the list of neighbours if others could have come near; returns False if it is too short."""
-    fastest, hardest = greatest_length(v), greatest_length(a.wanted)
+    fastest, hardest = greatest_row_norm(v), greatest_row_norm(a.wanted)
     due = a.count[LISTED] == 0 or fastest > a.span[1] or hardest > a.span[2]
     # Nor for speeds far below those for which it was made
     due = due or 2.5 * fastest + _LEAST_SPEED < 0.8 * a.span[1]
@@ -338,14 +338,14 @@ def set_obstacle_distance_floor(t, i, o, r, v, closest, a):
         required_obstacle_distance(i, o, speed, relative_braking_limit(i, o, a), a),
         a.shifted,
     )
-    apart = point_to_obstacle(way[0, 0], way[0, 1], way[0, 2], o, a.solids, a.normal) - stop
+    apart = obstacle_distance(way[0, 0], way[0, 1], way[0, 2], o, a.solids, a.normal) - stop
     a.walls[i, o] = need
     if a.threat[i] < 0:  # also one that is still far: a single tick may bring it near
         a.threat[i] = o
     if apart < need or apart - need < a.margin[OBSTACLE, 0]:
         # Rounding alone must not make the bound a loose one: the vehicle could lose a little at each tick
         enough = need - 10.0 * _ROUNDING
-        kept = refined_segment_to_obstacle(way[0], way[2], o, a.solids, enough, a.normal)
+        kept = refined_obstacle_distance(way[0], way[2], o, a.solids, enough, a.normal)
         a.walls[i, o] = min(need, kept)
         note_margin(OBSTACLE, kept - a.reach[i], t, i, o, a)
         if kept - need < closest or (apart < need and closest == 0.0):
@@ -354,7 +354,7 @@ def set_obstacle_distance_floor(t, i, o, r, v, closest, a):
 
 
 @jit
-def set_distance_floors(t, r, v, lost, a):
+def brake_and_set_floors(t, r, v, lost, a):
     """Let all vehicles brake, and find the distances that their stop segments keep, as they should or as they do."""
     n, acceleration = a.b.shape[0], a.trial[3]
     for i in range(n):
@@ -393,11 +393,11 @@ def set_distance_floors(t, r, v, lost, a):
                 a.late[i] = closest
                 continue
             need = a.reach[i] + a.spare[i]
-            apart = point_to_obstacle(r[i, 0], r[i, 1], r[i, 2], o, a.solids, a.normal) - a.far[i]
+            apart = obstacle_distance(r[i, 0], r[i, 1], r[i, 2], o, a.solids, a.normal) - a.far[i]
             a.walls[i, o] = need
             if apart < need or apart - need < a.margin[OBSTACLE, 0]:
                 way = a.ways[i]
-                kept = refined_segment_to_obstacle(way[4], way[3], o, a.solids, need, a.normal)
+                kept = refined_obstacle_distance(way[4], way[3], o, a.solids, need, a.normal)
                 a.walls[i, o] = min(need, kept)
                 note_margin(OBSTACLE, kept - a.reach[i], t, i, o, a)
 
@@ -586,7 +586,7 @@ def guard_forces(p, w, flight, state, a):
         a.count[FULL] = 1
         return 0
     a.count[TICKS] += 1
-    set_distance_floors(t, r, v, lost, a)
+    brake_and_set_floors(t, r, v, lost, a)
     changed = a.filtered and filter_accelerations(t, r, v, lost, p, w, a)
     for k in range(n):
         i = (k + a.count[TICKS]) % n  # each comes first in turn

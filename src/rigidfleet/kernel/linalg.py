@@ -12,7 +12,7 @@ def where_positive(x, a, b):
 
 
 @jit
-def surely_positive(x):
+def is_known_positive(x):
     """Whether x > 0; straight-line code cannot know and assumes that it is not (`tracer`)."""
     return x > 0.0
 

@@ -24,14 +24,14 @@ from rigidfleet.kernel.bernstein import (
     ball_radius,
     distance_to_box,
     least_height_in_cylinder,
-    least_norm,
+    least_norm_above,
     least_norm_of_curve,
     least_polynomial_value,
     norm_at,
     point_at,
     squared_norm_coefficients,
     tangent_of_box,
-    write_bernstein,
+    write_bernstein_basis,
 )
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.gauge import write_watched_forces
@@ -76,7 +76,7 @@ _NARROW = 1e-3
 
 
 @jit
-def take_if_worse(kind, key, t, first, second, monitor):
+def store_if_worse(kind, key, t, first, second, monitor):
     """Store a value that is worse than the worst one of its kind; a smaller ``key`` is worse."""
     if key < monitor.worst[kind]:
         monitor.worst[kind] = key
@@ -123,7 +123,7 @@ def find_body_frames(points, part, parts, p, monitor):
     quaternion = monitor.scratch[0]
     for k in range(5):
         basis = monitor.basis[k]
-        write_bernstein((part + KNOTS[k]) / parts, basis)
+        write_bernstein_basis((part + KNOTS[k]) / parts, basis)
         for s in range(4):
             quaternion[s] = bernstein_column_value(basis, points, first + s)
         for s in range(6):
@@ -319,11 +319,11 @@ def watch_pairs(kind, pairs, points, t, h, monitor):
         if below:
             value, at = least_height_in_cylinder(curve, radii, floor, monitor.pieces)
         elif flying:
-            value, at = least_norm(curve, own, other, monitor.altitude, floor, monitor.pieces)
+            value, at = least_norm_above(curve, own, other, monitor.altitude, floor, monitor.pieces)
         else:
             value, at = least_norm_of_curve(curve, floor, monitor.work, monitor.pieces)
         if at >= 0.0:
-            take_if_worse(kind, value - radii, t + at * h, i, j, monitor)
+            store_if_worse(kind, value - radii, t + at * h, i, j, monitor)
 
 
 @jit
@@ -336,7 +336,7 @@ def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
     if bound < monitor.worst[kind] - CLOSE:
         value, at = least_polynomial_value(work, 4, monitor.worst[kind])
         if at >= 0.0:
-            take_if_worse(kind, value, t + at * h, i, -1, monitor)
+            store_if_worse(kind, value, t + at * h, i, -1, monitor)
 
 
 @jit
@@ -355,7 +355,7 @@ def watch_speed(kind, curve, low, high, t, h, i, monitor):
     squared_norm_coefficients(piece, -1.0, monitor.work[0])
     _, at = least_polynomial_value(monitor.work, 8, -greatest * abs(greatest))
     if at >= 0.0:
-        take_if_worse(kind, -norm_at(piece, at), t + at * h, i, -1, monitor)
+        store_if_worse(kind, -norm_at(piece, at), t + at * h, i, -1, monitor)
 
 
 @jit
@@ -369,14 +369,14 @@ def clearance_to_beat(i, monitor):
 
 
 @jit
-def take_clearance(value, t, i, b, above, monitor):
+def store_clearance(value, t, i, b, above, monitor):
     """Store the clearance of agent i to obstacle b; of one ``above`` it, which may be landing, until it leaves."""
     low = monitor.low
-    take_if_worse(CLEARANCE, value, t, i, b, monitor)
+    store_if_worse(CLEARANCE, value, t, i, b, monitor)
     if not above:
-        take_if_worse(FLYING, value, t, i, b, monitor)
+        store_if_worse(FLYING, value, t, i, b, monitor)
     elif monitor.standing[i] != 0:
-        take_if_worse(STANDING, value, t, i, b, monitor)
+        store_if_worse(STANDING, value, t, i, b, monitor)
     elif value < low[i, 0]:
         low[i, 0], low[i, 1], low[i, 2] = value, t, float(b)
 
@@ -388,7 +388,7 @@ def note_departure(i, monitor):
     if monitor.standing[i] != 0:
         monitor.standing[i] = 0
     else:
-        take_if_worse(FLYING, low[i, 0], low[i, 1], i, int(low[i, 2]), monitor)
+        store_if_worse(FLYING, low[i, 0], low[i, 1], i, int(low[i, 2]), monitor)
         low[i, 0] = math.inf
 
 
@@ -413,7 +413,7 @@ def watch_obstacles(i, curve, t, h, last, monitor):
         if at >= 0.0:
             x_near, y_near, z_near = point_at(curve, at)
             _, _, up = box_normal(x_near, y_near, z_near, box)
-            take_clearance(value - radius, t + at * h, i, b, up >= STEEP, monitor)
+            store_clearance(value - radius, t + at * h, i, b, up >= STEEP, monitor)
     if not last or not (standing or monitor.low[i, 0] < math.inf):
         return
     for b in range(monitor.boxes.shape[0]):
@@ -475,27 +475,27 @@ def watch_step_distances(step, p, state, monitor):
 
 
 @jit
-def take_force_extremes(values, t, p, monitor):
+def update_force_extremes(values, t, p, monitor):
     """Take the forces of a gauge (3N + 2m or 5N + 2m,) at time t [s] into account."""
     n, edges = p.vehicles.m.shape[0], p.graph.edges
     m = edges.shape[0]
     for i in range(n):
         if monitor.left[i]:
             thrust = values[i]
-            take_if_worse(THRUST, -thrust, t, i, -1, monitor)
-            take_if_worse(THRUST_MARGIN, p.vehicles.thrust_limit[i] - thrust, t, i, -1, monitor)
-            take_if_worse(ACCELERATION, -values[n + i], t, i, -1, monitor)
-            take_if_worse(CONSTRAINT_FORCE, -values[2 * n + i], t, i, -1, monitor)
+            store_if_worse(THRUST, -thrust, t, i, -1, monitor)
+            store_if_worse(THRUST_MARGIN, p.vehicles.thrust_limit[i] - thrust, t, i, -1, monitor)
+            store_if_worse(ACCELERATION, -values[n + i], t, i, -1, monitor)
+            store_if_worse(CONSTRAINT_FORCE, -values[2 * n + i], t, i, -1, monitor)
             if values.shape[0] > 3 * n + 2 * m:
                 across, up = values[3 * n + 2 * m + i], values[4 * n + 2 * m + i]
-                take_if_worse(HORIZONTAL_ACCELERATION, -across, t, i, -1, monitor)
-                take_if_worse(VERTICAL_ACCELERATION, -abs(up), t, i, -1, monitor)
+                store_if_worse(HORIZONTAL_ACCELERATION, -across, t, i, -1, monitor)
+                store_if_worse(VERTICAL_ACCELERATION, -abs(up), t, i, -1, monitor)
     for k in range(m):
         pull, c = values[3 * n + k], values[3 * n + m + k]
         if -abs(pull) < monitor.worst[TENSION]:
             monitor.sign[0] = 1.0 if pull > 0.0 else -1.0
-        take_if_worse(TENSION, -abs(pull), t, edges[k, 0], edges[k, 1], monitor)
-        take_if_worse(CONSTRAINT, -abs(c), t, edges[k, 0], edges[k, 1], monitor)
+        store_if_worse(TENSION, -abs(pull), t, edges[k, 0], edges[k, 1], monitor)
+        store_if_worse(CONSTRAINT, -abs(c), t, edges[k, 0], edges[k, 1], monitor)
 
 
 @jit
@@ -524,14 +524,14 @@ def evaluate_forces(t, step, p, w, state, monitor, values):
     trail, row = state.trail, trail_row_of(step, state)
     x = (t - trail.clock[row, 0]) / trail.clock[row, 1]
     basis, y = monitor.basis[0], monitor.states[0]
-    write_bernstein(min(max(x, 0.0), 1.0), basis)
+    write_bernstein_basis(min(max(x, 0.0), 1.0), basis)
     for q in range(y.shape[0]):
         y[q] = bernstein_column_value(basis, trail.points[row], q)
     monitor.time[0] = t
     # The recorder contains the compiled law; without rows to write, it leaves all values in the workspace.
     call_recorder(monitor.recorder, p, w, monitor.segment, monitor.record)
     write_watched_forces(p, w, values)
-    take_force_extremes(values, t, p, monitor)
+    update_force_extremes(values, t, p, monitor)
 
 
 @jit
@@ -565,7 +565,7 @@ def parabola_excess(c, a, b, v, ta, tb, tc, p, monitor):
 
 
 @jit
-def search_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
+def search_forces_in(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
     """Search for the greatest forces between ta and tc, from gauges at ta < tb < tc.
 
     The law is evaluated where the parabola through three neighbouring values of an entry promises most. All entries
@@ -630,7 +630,7 @@ def watch_lone_step_forces(step, before, after, p, w, state, monitor):
     start, end = state.trail.clock[trail_row_of(step, state), 0], step_end_time(step, state)
     middle, values = 0.5 * (start + end), monitor.gauge[1]
     evaluate_forces(middle, step, p, w, state, monitor, values)
-    search_between(before, values, after, step, start, middle, end, p, w, state, monitor)
+    search_forces_in(before, values, after, step, start, middle, end, p, w, state, monitor)
 
 
 @jit
@@ -650,14 +650,14 @@ def watch_forces(last, p, w, state, monitor):
         if step == 0 and new:
             for c in range(before.shape[0]):
                 before[c] = trail.start[c]
-            take_force_extremes(before, start, p, monitor)
+            update_force_extremes(before, start, p, monitor)
         if new:
-            take_force_extremes(after, end, p, monitor)
+            update_force_extremes(after, end, p, monitor)
         if step == 0 and new:
             watch_lone_step_forces(0, before, after, p, w, state, monitor)
         if step + 1 < steps:
             then, until = trail.gauge[trail_row_of(step + 1, state)], step_end_time(step + 1, state)
-            search_between(earlier, after, then, step, start, end, until, p, w, state, monitor)
+            search_forces_in(earlier, after, then, step, start, end, until, p, w, state, monitor)
         elif last and (step > 0 or not new):
             watch_lone_step_forces(step, earlier, after, p, w, state, monitor)
     if last or steps == 0:

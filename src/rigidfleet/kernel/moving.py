@@ -16,8 +16,8 @@ import math
 from rigidfleet.kernel.avoidance import FOLLOWED, KNOWN, UNKNOWN
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import jit
-from rigidfleet.kernel.segments import least_along, point_to_obstacle, segment_to_obstacle
-from rigidfleet.solids.distance import is_present, solid_displacement
+from rigidfleet.kernel.segments import obstacle_distance, parabola_min, segment_obstacle_distance
+from rigidfleet.solids.distance import is_solid_present, solid_displacement
 
 #: Standard deviations that bounds of an estimate have.
 _SIGMAS = 3.0
@@ -82,7 +82,7 @@ def is_in_sight(o, x, y, z, r, lost, a):
     """Whether any vehicle is within sensing range of obstacle o, displaced by x, y, z [m]."""
     for i in range(r.shape[0]):
         if not lost[i]:
-            away = point_to_obstacle(r[i, 0] - x, r[i, 1] - y, r[i, 2] - z, o, a.solids, a.normal)
+            away = obstacle_distance(r[i, 0] - x, r[i, 1] - y, r[i, 2] - z, o, a.solids, a.normal)
             if away <= a.sight.reach:
                 return True
     return False
@@ -117,7 +117,7 @@ def update_tracks(t, r, lost, a):
     for o in range(s.moves.shape[0]):
         if s.moves[o] == 0:
             continue
-        if not is_present(t, o, a.solids):
+        if not is_solid_present(t, o, a.solids):
             s.known[o] = UNKNOWN
             continue
         x, y, z = solid_displacement(t, o, a.solids)
@@ -226,21 +226,21 @@ def moving_obstacle_margin(i, v, a):
         before, after = math.sqrt(before), math.sqrt(after)
         stop = way_to_rest(after, relative_braking_limit(i, o, a), a.lag[i], T)
         far = T * (before + 0.5 * T * math.sqrt(rise)) + stop
-        if point_to_obstacle(out[0, 0], out[0, 1], out[0, 2], o, a.solids, normal) - far >= floor:
+        if obstacle_distance(out[0, 0], out[0, 1], out[0, 2], o, a.solids, normal) - far >= floor:
             continue
         # Three distances: of the stop segment after the tick, of the chord of the tick, and of the parabola beyond it.
         for q in range(3):
             out[2, q] = out[1, q] + stop / max(after, 1e-12) * out[2, q]
-        bound, value, _ = segment_to_obstacle(out[1], out[2], o, a.solids, floor, normal)
+        bound, value, _ = segment_obstacle_distance(out[1], out[2], o, a.solids, floor, normal)
         room = min(room, (value if value < floor else bound) - floor)
-        bound, value, share = segment_to_obstacle(out[0], out[1], o, a.solids, floor, normal)
+        bound, value, share = segment_obstacle_distance(out[0], out[1], o, a.solids, floor, normal)
         room = min(room, (value if value < floor else bound) - floor)
         along = rate = lift = 0.0
         for q in range(3):
             along += normal[q] * (out[1, q] - out[0, q])
             rate += normal[q] * out[3, q]
             lift += normal[q] * way[4, q]
-        room = min(room, least_along(value - share * along, rate, min(lift, lift * E), T) - floor)
+        room = min(room, parabola_min(value - share * along, rate, min(lift, lift * E), T) - floor)
     return room
 
 
@@ -263,7 +263,7 @@ def miss_distance(r, v, c, a):
         until = min(2.0 * nearing / max(fast, 1e-12), _FARTHEST)
         for k in range(1, _LOOKS + 1):
             t = max(until, a.period) * k / _LOOKS
-            away = point_to_obstacle(
+            away = obstacle_distance(
                 r[0] - x[0] + t * (w[0] + 0.5 * t * c[0]), r[1] - x[1] + t * (w[1] + 0.5 * t * c[1]),
                 r[2] - x[2] + t * (w[2] + 0.5 * t * c[2]), o, a.solids, a.normal,
             )  # fmt: skip
@@ -290,7 +290,7 @@ def steer_round_obstacles(i, r, v, a):
         if not (s.ball[o] < math.inf and is_obstacle_known(o, a)):
             continue
         x = s.track[o]
-        away = point_to_obstacle(r[0] - x[0], r[1] - x[1], r[2] - x[2], o, a.solids, normal)
+        away = obstacle_distance(r[0] - x[0], r[1] - x[1], r[2] - x[2], o, a.solids, normal)
         size = _WIDER * (s.ball[o] + a.reach[i] + a.spare[i])
         share = 0.5 * (size / max(away + s.ball[o], size)) ** 3
         if share < _WEAK:

@@ -20,14 +20,14 @@ from rigidfleet.kernel.monitor import (
     find_body_frames,
     note_departure,
     rotation_bound,
-    take_clearance,
+    store_clearance,
     world_control_points,
 )
 from rigidfleet.solids.distance import (
     box_distance,
-    in_own_axes,
-    is_below,
-    is_present,
+    is_solid_below,
+    is_solid_present,
+    local_point,
     outward_normal,
     signed_distance,
     solid_displacement,
@@ -40,7 +40,7 @@ _SHORTEST = 2.0**-32
 
 
 @jit
-def tangent_of_solid(x, y, z, b, triangle, s):
+def solid_tangent_plane(x, y, z, b, triangle, s):
     """As `bernstein.tangent_of_box`, of solid b, or of one of its triangles if that is not -1."""
     if triangle < 0:
         nx, ny, nz = outward_normal(x, y, z, b, s)
@@ -53,7 +53,7 @@ def tangent_of_solid(x, y, z, b, triangle, s):
 
 
 #: As `distance_to_box`, of solid b or of one of its triangles.
-nearest_along = compiled_copy(distance_to_box, "nearest_along", tangent_of_box=tangent_of_solid)
+nearest_along = compiled_copy(distance_to_box, "nearest_along", tangent_of_box=solid_tangent_plane)
 
 
 @jit
@@ -104,14 +104,14 @@ def curve_in_solid_axes(curve, t, h, b, s, out):
         x = curve[k, 0] - (x0 + share * (x1 - x0))
         y = curve[k, 1] - (y0 + share * (y1 - y0))
         z = curve[k, 2] - (z0 + share * (z1 - z0))
-        out[k, 0], out[k, 1], out[k, 2] = in_own_axes(x, y, z, b, s)
+        out[k, 0], out[k, 1], out[k, 2] = local_point(x, y, z, b, s)
 
 
 @jit
 def point_in_solid_axes(x, y, z, t, b, s):
     """Coordinates of a point of the world in the axes of solid b at time t [s]."""
     u, v, w = solid_displacement(t, b, s)
-    return in_own_axes(x - u, y - v, z - w, b, s)
+    return local_point(x - u, y - v, z - w, b, s)
 
 
 @jit
@@ -144,8 +144,8 @@ def watch_solid(i, b, curve, t, h, s, monitor):
             if at >= 0.0:
                 share = start + at * (end - start)
                 x, y, z = point_at(curve, share)
-                above = is_below(x, y, z, b, s)
-                take_clearance(value - radius, t + share * h, i, b, above, monitor)
+                above = is_solid_below(x, y, z, b, s)
+                store_clearance(value - radius, t + share * h, i, b, above, monitor)
         start = end
 
 
@@ -158,25 +158,25 @@ def distance_bound(x, y, z, b, s):
 
 
 @jit
-def watch_landing(i, curve, t, s, monitor):
+def watch_departure(i, curve, t, s, monitor):
     """At the end (time t) of a step, tell whether agent i has left all obstacles below it."""
     if not (monitor.standing[i] != 0 or monitor.low[i, 0] < math.inf):
         return
     for b in range(s.kind.shape[0]):
-        if not is_present(t, b, s):
+        if not is_solid_present(t, b, s):
             continue
         u, v, w = curve[4, 0], curve[4, 1], curve[4, 2]
         x, y, z = point_in_solid_axes(u, v, w, t, b, s)
         near = monitor.radius[i] + monitor.pad
         if distance_bound(x, y, z, b, s) > near or signed_distance(x, y, z, b, s) > near:
             continue
-        if is_below(u, v, w, b, s):
+        if is_solid_below(u, v, w, b, s):
             return
     note_departure(i, monitor)
 
 
 @jit
-def watch_step(points, start, length, p, s, monitor):
+def watch_clearances(points, start, length, p, s, monitor):
     """Take the clearances of a step from ``start`` of a ``length`` [s]: control points (5, n) of the states."""
     curve, parts = monitor.curves[0], count_pieces(rotation_bound(points, p))
     h = length / parts
@@ -191,4 +191,4 @@ def watch_step(points, start, length, p, s, monitor):
             for b in range(s.kind.shape[0]):
                 watch_solid(i, b, curve, t, h, s, monitor)
             if part == parts - 1:
-                watch_landing(i, curve, t + h, s, monitor)
+                watch_departure(i, curve, t + h, s, monitor)

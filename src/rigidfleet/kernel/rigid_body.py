@@ -3,7 +3,7 @@
 import math
 
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
-from rigidfleet.kernel.linalg import jacobi_eigen, surely_positive, where_positive
+from rigidfleet.kernel.linalg import is_known_positive, jacobi_eigen, where_positive
 from rigidfleet.kernel.problem import PINV_EQUAL, PINV_INERTIA_FORCE, RIGID
 
 
@@ -51,7 +51,7 @@ def inertia_inverse(I, out):
     out[0, 0], out[0, 1], out[0, 2] = A * q, B * q, C * q
     out[1, 1], out[1, 2] = (a * f - c * c) * q, (b * c - a * e) * q
     out[2, 2] = (a * d - b * b) * q
-    if not surely_positive(spatial):
+    if not is_known_positive(spatial):
         q = where_positive(half, 1.0 / (half * half), 0.0)
         for i in range(3):
             for j in range(i, 3):

@@ -14,8 +14,8 @@ from rigidfleet.kernel.clock_records import OFF, RATE, SLOPE
 from rigidfleet.kernel.clocks import (
     advance_clocks,
     drop_constraint_force,
-    follow_own_clock,
     post_clock,
+    retime_plan,
     write_slots_by_own_clock,
 )
 from rigidfleet.kernel.compiler.calls import call_external, call_recorder
@@ -138,7 +138,7 @@ def integrate_constraints(dt, integral, p, w, state):
 
 
 @jit
-def expect_drag(i, v, share, vehicles, state):
+def compensate_drag(i, v, share, vehicles, state):
     """Add a share of the drag that vehicle i meets at a velocity v (3,) in still air to its desired force.
 
     The drag of rotors grows with their speed, which is that of the desired thrust.
@@ -162,7 +162,7 @@ def expect_drag(i, v, share, vehicles, state):
 
 
 @jit
-def take_desired_force(k, i, dt, p, w, flight, state):
+def write_desired_force(k, i, dt, p, w, flight, state):
     """Desired force of vehicle i [N] from the law just evaluated, with what is added after it, if it is not its own."""
     vehicles, guidance, own = flight.vehicles, flight.guidance, flight.commands.kind == OWN
     m, pull = p.vehicles.m[i], 0.0
@@ -174,7 +174,7 @@ def take_desired_force(k, i, dt, p, w, flight, state):
         record_if_worse(i, CONSTRAINT_FORCE, math.sqrt(pull), state.work.law_time[0], state)
     if p.control.kind == TRACKING:
         if guidance.drag[i] > 0.0 and not own:
-            expect_drag(i, w.v_ref[i], guidance.drag[i], vehicles, state)
+            compensate_drag(i, w.v_ref[i], guidance.drag[i], vehicles, state)
         for q in range(0 if own else 3):
             if not state.saturated[i]:
                 known = state.seen[i, q] + path_at(k, i, q, flight.tables)
@@ -195,7 +195,7 @@ def record_if_worse(i, kind, value, t, state):
 
 
 @jit
-def write_knowledge(k, t, p, w, flight, state):
+def write_known_states(k, t, p, w, flight, state):
     """What each vehicle knows at tick k, time t [s], into w: its measured state and, by one clock, the plan."""
     write_measured_states(k, w.r, w.v, flight, state)
     if not flight.clocks.own:
@@ -203,7 +203,7 @@ def write_knowledge(k, t, p, w, flight, state):
 
 
 @jit
-def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
+def evaluate_distributed_law(k, t, dt, p, w, flight, state):
     """Desired force of each vehicle from its own measured state, the plan and its neighbours' messages.
 
     ``dt`` [s] is the time between two evaluations. Of w, only the plan and the rows of vehicle i are read for i.
@@ -211,7 +211,7 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
     """
     net, mail, tick, stuck = flight.network, state.mail, flight.steps * flight.h, False
     state.work.law_time[0] = t
-    write_knowledge(k, t, p, w, flight, state)
+    write_known_states(k, t, p, w, flight, state)
     state.integral[:] = 0.0
     last = mail.multiplier.shape[1] - 1
     for i in range(state.S.shape[0]):
@@ -219,7 +219,7 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
             continue
         if flight.clocks.own:
             evaluate_plan(max(t + state.tau[i, OFF], p.motion.knots[0]), p, w)
-            stuck = follow_own_clock(i, k, t, p, w, flight, state)
+            stuck = retime_plan(i, k, t, p, w, flight, state)
         observe_disturbance(i, dt, w.v[i], net, mail)
         fade_silent_edges(i, k, flight.every, net, mail)
         if flight.commands.kind == OWN:
@@ -229,7 +229,7 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
             solve_own_constraint_force(i, k, dt, tick, p, w, net, mail, state.saturated[i])
         if stuck:
             drop_constraint_force(i, w, net, state)
-        take_desired_force(k, i, dt, p, w, flight, state)
+        write_desired_force(k, i, dt, p, w, flight, state)
         for q in range(3):
             mail.commanded[i, q] = state.force[i, q] * p.vehicles.inverse[i]
         mail.commanded[i, 2] -= p.vehicles.g
@@ -320,12 +320,12 @@ def find_desired_forces(k, t, p, w, flight, state, call):
     n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
     advance_frame(t, p, state)
     if flight.network.every > 0:
-        evaluate_by_neighbours(k, t, dt, p, w, flight, state)
+        evaluate_distributed_law(k, t, dt, p, w, flight, state)
     else:
         evaluate_law(k, t, state.seen, state.integral, p, w, flight, state, call)
         integrate_constraints(dt, state.integral, p, w, state)
         for i in range(n):
-            take_desired_force(k, i, dt, p, w, flight, state)
+            write_desired_force(k, i, dt, p, w, flight, state)
     if p.has_frame:
         for i in range(n):
             for q in range(3):
@@ -471,7 +471,7 @@ def write_samples(t, h, p, flight, state, call):
 
 
 @jit
-def keep_step_path(i, h, work, points):
+def write_step_curve(i, h, work, points):
     """Bernstein coefficients (5, 6 N) of vehicle i over a step: of the quartic through r0, v0, a0, r1, v1; its rate."""
     own = slice(17 * i, 17 * i + 17)
     first, end, rate = work.y[0, own], work.y[6, own], work.y[2, own]
@@ -490,7 +490,7 @@ def keep_step_path(i, h, work, points):
 
 
 @jit
-def take_extremes(i, t, h, vehicles, state):
+def update_extremes(i, t, h, vehicles, state):
     """Extremes of vehicle i over a step from t [s]: at its end, the acceleration at its start.
 
     A rotor's speed is monotone while its command is held, so the ends of steps have its greatest thrust. The
@@ -535,9 +535,9 @@ def advance_fleet(t, h, p, flight, state):
     advance_states(state.S, h, flight, state)
     for i in range(state.S.shape[0]):
         if not flight.vehicles.lost[i]:
-            take_extremes(i, t, h, flight.vehicles, state)
+            update_extremes(i, t, h, flight.vehicles, state)
         if kept:
-            keep_step_path(i, h, state.work, trail.points[row])
+            write_step_curve(i, h, state.work, trail.points[row])
         for q in range(17):
             state.S[i, q] = state.work.y[6, 17 * i + q]
     return True
@@ -549,7 +549,7 @@ def measure_for_laws(k, t, p, w, flight, state):
     measure_states(k, flight, state)
     if flight.commands.kind == OWN:
         receive(k, flight.network, state.mail)
-        write_knowledge(k, t, p, w, flight, state)
+        write_known_states(k, t, p, w, flight, state)
 
 
 @jit

@@ -4,7 +4,7 @@ import math
 
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import jit
-from rigidfleet.solids.distance import in_own_axes, outward_normal, signed_distance
+from rigidfleet.solids.distance import local_point, outward_normal, signed_distance
 
 #: Greatest number of tangents by which the nearest point of a segment to an obstacle is sought.
 _TANGENTS = 40
@@ -13,9 +13,9 @@ _STEPS = 100
 
 
 @jit
-def point_to_obstacle(x, y, z, o, solids, normal):
+def obstacle_distance(x, y, z, o, solids, normal):
     """Signed distance [m] of a point from obstacle o, as it stands without motion; writes its gradient (3,)."""
-    x, y, z = in_own_axes(x, y, z, o, solids)
+    x, y, z = local_point(x, y, z, o, solids)
     u, v, w = outward_normal(x, y, z, o, solids)
     normal[0], normal[1], normal[2] = u, v, w
     if solids.turned[o] != 0:
@@ -92,12 +92,12 @@ def hull_distance(p, last, a, q, end, b, enough, x):
 def distance_and_slope(p, q, x, o, solids, normal):
     """Distance of a point at a share x of a segment from obstacle o, and its rate along it; writes the normal."""
     u, v, w = q[0] - p[0], q[1] - p[1], q[2] - p[2]
-    value = point_to_obstacle(p[0] + x * u, p[1] + x * v, p[2] + x * w, o, solids, normal)
+    value = obstacle_distance(p[0] + x * u, p[1] + x * v, p[2] + x * w, o, solids, normal)
     return value, normal[0] * u + normal[1] * v + normal[2] * w
 
 
 @jit
-def segment_to_obstacle(p, q, o, solids, enough, normal):
+def segment_obstacle_distance(p, q, o, solids, enough, normal):
     """Distance of the segment from p to q (3,) from obstacle o: a lower bound, and a place near the nearest point.
 
     The distance to a convex obstacle is convex along the segment, so that it lies above its tangents. The bound is
@@ -126,16 +126,16 @@ def segment_to_obstacle(p, q, o, solids, enough, normal):
 
 
 @jit
-def refined_segment_to_obstacle(p, q, o, solids, need, normal):
+def refined_obstacle_distance(p, q, o, solids, need, normal):
     """Distance of the segment from p to q (3,) from obstacle o: exact below ``need``, else a lower bound."""
-    kept, _, _ = segment_to_obstacle(p, q, o, solids, need, normal)
+    kept, _, _ = segment_obstacle_distance(p, q, o, solids, need, normal)
     if kept < need:
-        kept, _, _ = segment_to_obstacle(p, q, o, solids, math.nan, normal)
+        kept, _, _ = segment_obstacle_distance(p, q, o, solids, math.nan, normal)
     return kept
 
 
 @jit
-def least_along(x, rate, rise, T):
+def parabola_min(x, rate, rise, T):
     """Least value of x + rate t + rise t^2 / 2 over [0, T]."""
     least = min(x, x + T * (rate + 0.5 * T * rise))
     if rise > 0.0 and -rise * T < rate < 0.0:

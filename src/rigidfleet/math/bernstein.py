@@ -54,10 +54,10 @@ def greatest_convex_value(points: Floats, size: Callable[[Floats], Floats]) -> G
         ends = sizes[:, [0, -1]]
         return ends.max(axis=1), ends.argmax(axis=1).astype(float), sizes.max(axis=1)
 
-    return greatest_by_measure(points, measure_size, lambda best: _CLOSE * max(abs(best), 1e-3))
+    return greatest_curve_measure(points, measure_size, lambda best: _CLOSE * max(abs(best), 1e-3))
 
 
-def greatest_by_measure(
+def greatest_curve_measure(
     points: Floats, measure: Measure, close: Callable[[float], float], least: float = -np.inf
 ) -> Greatest:
     """Greatest value that curves with control points (M, C, P) reach by a measure.

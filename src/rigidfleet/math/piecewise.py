@@ -65,7 +65,7 @@ class Piecewise(NamedTuple):
     def taylor_coefficients(self, t: Floats, orders: int) -> Floats:
         """Taylor coefficients (orders, T, ...) at times (T,) [s]."""
         k = piece_index(self.time, t)
-        return series.of_polynomials(_take_pieces(self.pieces, k), t - self.time[k], orders)
+        return series.polynomial_series(_take_pieces(self.pieces, k), t - self.time[k], orders)
 
     def at(self, t: Floats) -> Floats:
         """Values (T, ...) at times (T,) [s]."""
@@ -78,14 +78,14 @@ class Piecewise(NamedTuple):
     def states_at_ends(self, orders: int) -> tuple[Floats, Floats]:
         """Value and derivatives (orders, K, ...) at the beginning and at the end of each piece."""
         times = np.zeros(len(self.pieces)), np.diff(self.time)
-        begin, end = (series.of_polynomials(self.pieces, t, orders) for t in times)
+        begin, end = (series.polynomial_series(self.pieces, t, orders) for t in times)
         return series.derivatives(begin), series.derivatives(end)
 
     def at_shares(self, shares: Floats) -> Floats:
         """Values (K, S, ...) of each piece at shares (S,) of its time."""
         after = np.diff(self.time)[:, None] * shares
         each = _take_pieces(self.pieces, np.repeat(np.arange(len(after)), len(shares)))
-        values = series.of_polynomials(each, after.ravel(), 1)[0]
+        values = series.polynomial_series(each, after.ravel(), 1)[0]
         return values.reshape(*after.shape, *values.shape[1:])
 
     def derivative_curve(self) -> Piecewise:
@@ -94,8 +94,8 @@ class Piecewise(NamedTuple):
 
     def jumps(self, orders: int) -> Floats:
         """Jumps (orders, K - 1, ...) of value and derivatives at the inner knots."""
-        end = series.of_polynomials(self.pieces[:-1], np.diff(self.time)[:-1], orders)
-        begin = series.of_polynomials(self.pieces[1:], np.zeros(len(self.pieces) - 1), orders)
+        end = series.polynomial_series(self.pieces[:-1], np.diff(self.time)[:-1], orders)
+        begin = series.polynomial_series(self.pieces[1:], np.zeros(len(self.pieces) - 1), orders)
         return series.derivatives(begin - end)
 
     def shift_time(self, start: float) -> Piecewise:
@@ -166,7 +166,7 @@ def hermite_pieces(h: Floats, begin: Floats, end: Floats) -> Floats:
     m = len(begin)
     h = h.reshape(-1, *(1,) * (begin.ndim - 2))
     scale = np.stack([h**k for k in range(2 * m)])
-    start = series.from_derivatives(begin) * scale[:m]  # coefficients in u = (t - t0) / h
+    start = series.series_by_derivatives(begin) * scale[:m]  # coefficients in u = (t - t0) / h
     reached = [sum(start[k] * float(perm(k, j)) for k in range(j, m)) for j in range(m)]
     rest = np.tensordot(_hermite_end_matrix(m), end * scale[:m] - np.stack(reached), 1)
     return np.moveaxis(np.concatenate([start, rest]) / scale, 0, -1)
@@ -197,7 +197,7 @@ def common_knots(curves: Sequence[Piecewise]) -> Floats:
     return knots
 
 
-def join_curves(curves: Sequence[Piecewise], most: float = np.inf) -> Piecewise:
+def stack_ways(curves: Sequence[Piecewise], most: float = np.inf) -> Piecewise:
     """N curves as one (K, N, ..., P) on their `common_knots`; each stays where it begins and ends.
 
     Raises
@@ -238,7 +238,7 @@ def pad(pieces: Floats, powers: int) -> Floats:
 
 
 def _take_pieces(pieces: Floats, k: Ints) -> Floats:
-    """Pieces (k, ..., P); of many, each coefficient is a row in memory, as `series.of_polynomials` takes them."""
+    """Pieces (k, ..., P); of many, each coefficient is a row in memory, as `series.polynomial_series` takes them."""
     if len(k) < len(pieces):
         return pieces[k]
     turned = -1, *range(1, pieces.ndim - 1), 0
@@ -247,7 +247,7 @@ def _take_pieces(pieces: Floats, k: Ints) -> Floats:
 
 def expand_about(pieces: Floats, x: Floats) -> Floats:
     """Coefficients (K, ..., P) of the same polynomials in powers of the time since x (K,) [s]."""
-    return np.moveaxis(series.of_polynomials(pieces, x, pieces.shape[-1]), 0, -1)
+    return np.moveaxis(series.polynomial_series(pieces, x, pieces.shape[-1]), 0, -1)
 
 
 def _piece_widths(time: Floats, pieces: Floats) -> Floats:

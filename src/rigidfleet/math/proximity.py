@@ -249,7 +249,7 @@ def obstacle_clearances(
     some = max(1, CACHED * n // max(1, r.size))
     for first in range(0, n if obstacles else 0, some):
         part = slice(first, first + some)
-        _add_obstacles(least[part], nearest[part], r[..., part, :], radius[part], obstacles, time)
+        _update_nearest(least[part], nearest[part], r[..., part, :], radius[part], obstacles, time)
     return least.T, nearest.T
 
 
@@ -265,11 +265,11 @@ def below(
         near = np.flatnonzero(distances(*r.T, thing.solid, time) <= radius + reach)
         for first in range(0, len(near), _TOGETHER):
             some = near[first : first + _TOGETHER]
-            under[b, some] = distance.is_below(*r[some].T, 0, thing.solid)
+            under[b, some] = distance.is_solid_below(*r[some].T, 0, thing.solid)
     return under
 
 
-def _add_obstacles(
+def _update_nearest(
     least: Floats,
     nearest: Ints,
     r: Floats,
@@ -304,7 +304,7 @@ def distances(
     if solid.moves:
         shift = distance.solid_displacement(np.asarray(time, dtype=float).T, 0, solid)
         x, y, z = x - shift[0], y - shift[1], z - shift[2]
-    x, y, z = distance.in_own_axes(x, y, z, 0, solid)
+    x, y, z = distance.local_point(x, y, z, 0, solid)
     if solid.kind[0] in _SURFACES:
         away = np.full(x.shape, np.inf)
         near = np.flatnonzero((distance.box_distance(x, y, z, solid.size[0]) < most).reshape(-1))
@@ -316,7 +316,7 @@ def distances(
         away = distance.signed_distance(x, y, z, 0, solid)
     if not any(map(math.isfinite, solid.there[0].tolist())):
         return away
-    there = distance.is_present(np.asarray(time, dtype=float).T, 0, solid)
+    there = distance.is_solid_present(np.asarray(time, dtype=float).T, 0, solid)
     return np.where(there, away, np.inf)
 
 

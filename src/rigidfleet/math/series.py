@@ -28,7 +28,7 @@ def derivatives(x: Floats) -> Floats:
     return x * _factorials_per_order(x)
 
 
-def from_derivatives(x: Floats) -> Floats:
+def series_by_derivatives(x: Floats) -> Floats:
     """The series of which `derivatives` are ``x`` (n + 1, ...)."""
     return x / _factorials_per_order(x)
 
@@ -37,12 +37,12 @@ def _factorials_per_order(x: Floats) -> Floats:
     return _FACTORIALS[: len(x)].reshape(-1, *(1,) * (x.ndim - 1))
 
 
-def differentiate(x: Floats) -> Floats:
+def rate_series(x: Floats) -> Floats:
     """The series of x', one order shorter."""
     return x[1:] * np.arange(1.0, len(x)).reshape(-1, *(1,) * (x.ndim - 1))
 
 
-def of_polynomials(coefficients: Floats, x: Floats, orders: int) -> Floats:
+def polynomial_series(coefficients: Floats, x: Floats, orders: int) -> Floats:
     """Series (orders, K, ...) of polynomials with coefficients (K, ..., P), ascending, at x (K,).
 
     In memory, x is the last axis: arithmetic on long rows is fast.
@@ -104,7 +104,7 @@ def rotation_vector_series(R: Floats) -> Floats:
     phi[0] = att.rotation_vector_from_dcm(np.swapaxes(R[0], -1, -2))
     for k in range(1, len(R) if R[1:].any() else 1):  # most bodies do not turn
         lacking = R[k] - rotation_series(phi[: k + 1])[k] if k > 1 else R[k]  # nothing moves yet
-        phi[k] = att.rotation_vector_rate(phi[0], _axial(np.swapaxes(R[0], -1, -2) @ lacking))
+        phi[k] = att.rotation_vector_rate(phi[0], _vee_vectors(np.swapaxes(R[0], -1, -2) @ lacking))
     return phi
 
 
@@ -118,7 +118,7 @@ def rotation_series_from_rates(R: Floats, omega: Floats) -> Floats:
 
 def body_rates_series(R: Floats) -> Floats:
     """Series (n - 1, ..., 3) of the rates [rad/s] in body axes of rotations R (n, ..., 3, 3), body to world."""
-    return _axial(product(np.swapaxes(R, -1, -2)[:-1], differentiate(R), np.matmul))
+    return _vee_vectors(product(np.swapaxes(R, -1, -2)[:-1], rate_series(R), np.matmul))
 
 
 def angle_series(y: Floats, x: Floats) -> Floats:
@@ -128,7 +128,7 @@ def angle_series(y: Floats, x: Floats) -> Floats:
     size = x[0] ** 2 + y[0] ** 2
     safe = np.where(size > 0.0, size, np.inf)
     turned, square = (
-        product(x[:-1], differentiate(y)) - product(y[:-1], differentiate(x)),
+        product(x[:-1], rate_series(y)) - product(y[:-1], rate_series(x)),
         product(x, x) + product(y, y),
     )
     rates = np.zeros_like(turned)  # angle' (x^2 + y^2) = x y' - y x'
@@ -145,7 +145,7 @@ def cross_matrix(a: Floats) -> Floats:
     return W - np.swapaxes(W, -1, -2)
 
 
-def _axial(W: Floats) -> Floats:
+def _vee_vectors(W: Floats) -> Floats:
     """Vectors (..., 3) of the antisymmetric parts of matrices (..., 3, 3)."""
     return 0.5 * np.stack(
         [W[..., 2, 1] - W[..., 1, 2], W[..., 0, 2] - W[..., 2, 0], W[..., 1, 0] - W[..., 0, 1]],
@@ -180,7 +180,7 @@ def _stumpff_series(u: Floats, count: int) -> tuple[Floats, Floats, Floats]:
 
     c_k' = (k c_(k+2) - c_(k+1)) / 2 gives each order from the order before of the following functions.
     """
-    n, slope = len(u), differentiate(u)
+    n, slope = len(u), rate_series(u)
     orders = [_stumpff(u[0], count)]
     chain: list[Floats] = []  # derivatives by u
     for order in range(1, n):

@@ -15,7 +15,7 @@ import numpy as np
 from rigidfleet._common.facts import value as show
 from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet.math import falls
-from rigidfleet.math.bernstein import Measure, Measured, greatest_by_measure
+from rigidfleet.math.bernstein import Measure, Measured, greatest_curve_measure
 from rigidfleet.math.piecewise import Piecewise, pad
 from rigidfleet.mission.model import Mission
 from rigidfleet.solids.polygons import Region, curve_middles
@@ -123,7 +123,7 @@ class Boundaries:
         for share in np.linspace(0.0, 1.0, _HEIGHTS) if mission.roofs.kind.size else ():
             height = level + share * (r[..., 2] - level)
             x, y = np.moveaxis(self.places_of_falls(r, v, height), 2, 0)
-            above = mission.height_at(x, y) >= height
+            above = mission.height_below(x, y) >= height
             ends[above] = np.stack([x, y, height], axis=2)[above]
         return ends
 
@@ -173,7 +173,7 @@ class BoundaryWatch:
         self._waiting: list[tuple[Floats, Floats]] = []
         self._left: Bools | None = None
 
-    def take_steps(self, clock: Floats, points: Floats, left: Bools) -> None:
+    def add_steps(self, clock: Floats, points: Floats, left: Bools) -> None:
         """Take steps with starts and lengths (S, 2) [s], and control points (S, N, 6, P) of positions and velocities.
 
         Agents ``left`` (N,) count.
@@ -187,7 +187,7 @@ class BoundaryWatch:
         if sum(len(steps) for steps, _ in self._waiting) * len(left) > _TOGETHER:
             self.search()
 
-    def take_way(self, way: Piecewise, left: Bools | None = None) -> None:
+    def add_way(self, way: Piecewise, left: Bools | None = None) -> None:
         """Take ways (K, N, 3, P) of agents, of whom those ``left`` (N,) count, by default all."""
         n, powers = way.pieces.shape[1], max(way.pieces.shape[-1], 2)
         left = np.ones(n, dtype=np.bool_) if left is None else left
@@ -197,7 +197,7 @@ class BoundaryWatch:
             both = part, part.derivative_curve()
             points = [Piecewise(x.time, pad(x.pieces, powers)).control_points() for x in both]
             clock = np.column_stack([part.time[:-1], np.diff(part.time)])
-            self.take_steps(clock, np.concatenate(points, axis=2), left)
+            self.add_steps(clock, np.concatenate(points, axis=2), left)
 
     def search(self) -> dict[str, Worst]:
         """The worst values of all steps so far, by quantity."""
@@ -235,7 +235,7 @@ class BoundaryWatch:
             ) -> Measured:
                 return x.measure(p, who[curve])
 
-            peak = greatest_by_measure(points[step, who], measure, lambda _, x=x: x.close, least)
+            peak = greatest_curve_measure(points[step, who], measure, lambda _, x=x: x.close, least)
             if peak.curve >= 0:
                 t, h = clock[step[peak.curve]].tolist()
                 self._keep_worst(x, peak.value, t + peak.place * h, int(agents[who[peak.curve]]))

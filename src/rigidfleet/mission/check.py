@@ -31,7 +31,7 @@ from rigidfleet.mission import (
 )
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys, look_up, model_of, suggest_shape
-from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key_rules
+from rigidfleet.mission.rules import Breach, Breaches, Draft, unused_key_rules
 from rigidfleet.mission.schema import Agents, Contents, MissionHeader, Regulator, Start, Tracking
 
 #: Models of the single tables. Obstacles, phases, fences and people are arrays of tables.
@@ -313,7 +313,7 @@ def _tracking_rules(m: Draft) -> Breaches:
 def _allocation_rules(m: Draft) -> Breaches:
     """The torque is divided by the method that divides it."""
     if m.is_valid(("allocation",), "method"):
-        yield from idle_key_rules(m.allocation, "torque_split", "method", "pinv")
+        yield from unused_key_rules(m.allocation, "torque_split", "method", "pinv")
 
 
 def _limit_rules(m: Draft) -> Breaches:
@@ -341,7 +341,7 @@ def _yaw_rules(m: Draft) -> Breaches:
         remedy = "add point: the point to look at, [x, y, z] [m]"
         yield Breach("point", "is missing", remedy)
     for key, kind in (("yaw_deg", "fixed"), ("point", "towards")):
-        yield from idle_key_rules(yaw, key, "kind", kind)
+        yield from unused_key_rules(yaw, key, "kind", kind)
 
 
 def _corner_rules(box: Any, below: Keys) -> Breaches:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key_rules
+from rigidfleet.mission.rules import Breach, Breaches, Draft, unused_key_rules
 from rigidfleet.mission.schema import Disturbances, Gusts
 from rigidfleet.mission.vehicles import NOT_SAMPLED
 from rigidfleet.typing import Floats
@@ -72,12 +72,12 @@ def disturbance_rules(m: Draft) -> Breaches:
 def _gust_rules(m: Draft, gusts: Gusts, wind: bool) -> Breaches:
     """Gusts have the keys of their model, and no others."""
     spread = "add the standard deviation of the gusts [m/s]"
-    yield from idle_key_rules(gusts, "time_scale", "model", "first-order")
+    yield from unused_key_rules(gusts, "time_scale", "model", "first-order")
     if gusts.model == "first-order":
         if gusts.time_scale is None:
             yield Breach("time_scale", "is missing", "add the correlation time of the gusts [s]")
         for key in ("length", "altitude", "airspeed"):
-            yield from idle_key_rules(gusts, key, "model", "dryden")
+            yield from unused_key_rules(gusts, key, "model", "dryden")
         if gusts.intensity is None:
             yield Breach("intensity", "is missing", spread)
     else:

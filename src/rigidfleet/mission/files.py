@@ -73,7 +73,7 @@ def inline_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str,
 
         name = named.table[named.key]
         content = b"".join(
-            read_bytes(_file_inside(path, named.where, x)) for x in _names_of_files(path, named)
+            read_bytes(_path_in_folder(path, named.where, x)) for x in _names_of_files(path, named)
         )
         rows, colours, notes = named.read(content, str(path.parent / name))
         origin = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
@@ -110,7 +110,7 @@ def _names_of_files(path: Path, named: _Named) -> list[str]:
         The folder has no files, or is outside the mission's.
     """
     name = named.table[named.key]
-    place = _file_inside(path, named.where, name)
+    place = _path_in_folder(path, named.where, name)
     if not named.folder or not place.is_dir():
         return [name]
     from rigidfleet.foreign.files import groups_of_files
@@ -157,7 +157,7 @@ def _tables_with_file(
             yield k, own
 
 
-def _file_inside(path: Path, where: str, name: str) -> Path:
+def _path_in_folder(path: Path, where: str, name: str) -> Path:
     """The file of a name, which may not leave the folder of the mission, not by a link either.
 
     Raises

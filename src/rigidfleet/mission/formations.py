@@ -15,7 +15,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import FindingCollector, Keys, suggest_shape
-from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key_rules
+from rigidfleet.mission.rules import Breach, Breaches, Draft, unused_key_rules
 from rigidfleet.mission.schema import Formation
 
 #: Maximum number of contradictions among distances that are listed.
@@ -73,7 +73,7 @@ def _own_formation_rules(m: Draft, form: Formation, name: str) -> Breaches:
     """A formation has slots or distances for all agents, and nothing without effect."""
     path, n = ("formations", name), m.n
     if n is not None and (form.rest is not None or form.agents is not None):
-        m.formations[name] = form = yield from _with_rest(m, form, n, path)
+        m.formations[name] = form = yield from _add_slots(m, form, n, path)
     right = m.is_valid(path, "shape", "size", "slots", "distances")
     if form.shape is not None and form.slots is not None:
         yield Breach("slots", "a shape has its own slots", "give either shape and size or slots")
@@ -118,7 +118,7 @@ def _own_formation_rules(m: Draft, form: Formation, name: str) -> Breaches:
             yield Breach("dimension", problem, "use 3, or move the slots into a plane")
 
 
-def _with_rest(m: Draft, form: Formation, n: int, path: Keys) -> Generator[Breach, None, Formation]:
+def _add_slots(m: Draft, form: Formation, n: int, path: Keys) -> Generator[Breach, None, Formation]:
     """A formation of fewer than n agents gets slots for all: those that rest come last."""
     slots = form.slots
     if form.agents is not None:
@@ -204,7 +204,7 @@ def _edge_rules(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
 
 def _graph_rules(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
     """A named graph can be derived from the slots; all except 'complete' are."""
-    yield from idle_key_rules(form, "reach", "edges", "neighbours")
+    yield from unused_key_rules(form, "reach", "edges", "neighbours")
     if form.edges == "complete":
         return
     right = m.is_valid(path, "shape", "size", "slots")

@@ -30,7 +30,7 @@ def read_geojson(data: bytes, name: str) -> tuple[list[list[list[list[float]]]],
         remedy = "convert it to longitude and latitude (WGS 84), as GeoJSON asks"
         raise text_error(name, f"has the coordinate reference system {crs!r}", remedy)
     try:
-        polygons = [[_ring(ring, notes) for ring in rings] for rings in _polygons(root, notes)]
+        polygons = [[_mend_ring(ring, notes) for ring in rings] for rings in _polygons(root, notes)]
     except (ValueError, TypeError, AttributeError, LookupError, RecursionError):
         remedy = "give polygons as lists of rings of [longitude, latitude], in degrees"
         raise text_error(name, "has coordinates that are no polygons", remedy) from None
@@ -52,7 +52,7 @@ def _polygons(node: dict[str, Any], notes: list[str]) -> Iterator[list[Any]]:
         notes.append(f"a {kind} is left out")
 
 
-def _ring(ring: list[Any], notes: list[str]) -> list[list[float]]:
+def _mend_ring(ring: list[Any], notes: list[str]) -> list[list[float]]:
     """Corners of a ring, each once."""
     if any(type(x) not in (int, float) for corner in ring for x in corner):
         raise TypeError

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet.foreign.curves import rows_to_curve
-from rigidfleet.math.piecewise import Piecewise, join_curves
+from rigidfleet.math.piecewise import Piecewise, stack_ways
 from rigidfleet.mission import values
 from rigidfleet.mission.values import AUTO, Part, key, models_by_kind, required_key
 from rigidfleet.typing import Ints
@@ -249,7 +249,7 @@ class Shaping(AnyPhase):
     @property
     def leads_to(self) -> str:
         """The formation, and its place and angles if they are commanded."""
-        place = [] if self.position is None else [_vector(self.position, "m")]
+        place = [] if self.position is None else [_as_text(self.position, "m")]
         return ", ".join([self.formation, *place, *self.angles_in_words])
 
     def keys_if_ended(self, length: float) -> dict[str, Any]:
@@ -318,7 +318,7 @@ class Steering(Attitude, AnyPhase):
     @property
     def leads_to(self) -> str:
         """The commanded angles and rates."""
-        rates = [_vector(self.rates_deg_s, "°/s")] if any(self.rates_deg_s) else []
+        rates = [_as_text(self.rates_deg_s, "°/s")] if any(self.rates_deg_s) else []
         return ", ".join([*self.angles_in_words, *rates])
 
 
@@ -358,9 +358,9 @@ class Fly(Steering):
     def leads_to(self) -> str:
         """The waypoint and the attitude."""
         v = self.velocity
-        velocity = ["any velocity" if isinstance(v, str) else _vector(v, "m/s")] if any(v) else []
+        velocity = ["any velocity" if isinstance(v, str) else _as_text(v, "m/s")] if any(v) else []
         rest = super().leads_to
-        return ", ".join([_vector(self.position, "m"), *velocity, *([rest] if rest else [])])
+        return ", ".join([_as_text(self.position, "m"), *velocity, *([rest] if rest else [])])
 
 
 class Go(Attitude, AnyPhase):
@@ -386,7 +386,7 @@ class Go(Attitude, AnyPhase):
     @property
     def leads_to(self) -> str:
         """The position and the attitude."""
-        return ", ".join([_vector(self.position, "m"), *self.angles_in_words])
+        return ", ".join([_as_text(self.position, "m"), *self.angles_in_words])
 
 
 class Turn(Steering):
@@ -544,7 +544,7 @@ class Follow(Cruising):
         ValueError
             They have too many knots in all.
         """
-        return join_curves([rows_to_curve(rows) for rows in self.trajectories or ()], _COEFFICIENTS)
+        return stack_ways([rows_to_curve(rows) for rows in self.trajectories or ()], _COEFFICIENTS)
 
     @property
     def leads_to(self) -> str:
@@ -590,7 +590,7 @@ class Orbit(Cruising):
     @property
     def leads_to(self) -> str:
         """The circle."""
-        return f"round {_vector(self.centre, 'm')} at {self.radius:g} m, {self.rate_deg_s:g}°/s"
+        return f"round {_as_text(self.centre, 'm')} at {self.radius:g} m, {self.rate_deg_s:g}°/s"
 
 
 def seconds(time: float | Literal["auto"]) -> float:
@@ -598,7 +598,7 @@ def seconds(time: float | Literal["auto"]) -> float:
     return math.nan if isinstance(time, str) else time
 
 
-def _vector(numbers: Sequence[float], unit: str) -> str:
+def _as_text(numbers: Sequence[float], unit: str) -> str:
     return f"({', '.join(f'{value:g}' for value in numbers)}) {unit}"
 
 

@@ -13,7 +13,7 @@ from rigidfleet.mission.formations import has_no_findings
 from rigidfleet.mission.kinds import AnyPhase, seconds
 from rigidfleet.mission.obstacles import is_ground
 from rigidfleet.mission.phases import named_agent_rules
-from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key_rules
+from rigidfleet.mission.rules import Breach, Breaches, Draft, unused_key_rules
 from rigidfleet.mission.schema import Aborting, Disturbances
 from rigidfleet.typing import Floats
 
@@ -44,13 +44,13 @@ def loss_rules(m: Draft) -> Breaches:
     yield from _lost_vehicle_rules(m, d)
     for k, one in enumerate(d.stuck):
         path = (_TABLE, "stuck", k)
-        yield from agent_rules(m, (*path, "agent"), (one.agent,))
+        yield from agent_number_rules(m, (*path, "agent"), (one.agent,))
         yield from loss_time_rules(m, one.time, path)
     if d.stuck and m.network is None and m.is_valid((), "network"):
         problem = "needs vehicles that fly by themselves: without [network], one law commands all"
         yield Breach((_TABLE, "stuck"), problem, "add [network], or remove it", None)
     for key, needed in ON_LOSS.items():
-        m.record_breaches((_TABLE,), idle_key_rules(d, key, "on_loss", needed))
+        m.record_breaches((_TABLE,), unused_key_rules(d, key, "on_loss", needed))
     times = [lost.time for lost in (*d.lost, *links)]
     if d.on_loss == "continue" or not times or m.n is None or m.findings:
         return
@@ -97,7 +97,7 @@ def _lost_vehicle_rules(m: Draft, d: Disturbances) -> Breaches:
     for k, one in enumerate(d.lost):
         path = (_TABLE, "lost", k)
         again = "is lost twice" if one.agent in lost[:k] else ""
-        yield from agent_rules(m, (*path, "agent"), (one.agent,), again)
+        yield from agent_number_rules(m, (*path, "agent"), (one.agent,), again)
         yield from loss_time_rules(m, one.time, path)
     if m.n is not None and len(set(lost)) >= m.n:
         yield Breach((_TABLE, "lost"), "all vehicles are lost", "keep at least one")
@@ -112,7 +112,7 @@ def _lost_vehicle_rules(m: Draft, d: Disturbances) -> Breaches:
             yield Breach((_TABLE, "lost"), problem, f"use {key} = '{possible}'")
 
 
-def agent_rules(m: Draft, where: Keys, agents: Sequence[int], again: str = "") -> Breaches:
+def agent_number_rules(m: Draft, where: Keys, agents: Sequence[int], again: str = "") -> Breaches:
     """Agents exist, and are not lost ``again``, in words."""
     if m.n is not None and not all(1 <= agent <= m.n for agent in agents):
         yield Breach(where, "there is no such agent", f"agents are numbered from 1 to {m.n}")

@@ -487,7 +487,7 @@ class Mission(Contents, Shown):
         """What counts as ground besides it: height maps, and boxes at rest that are no zones."""
         return join_solids([o.solid for o in self.solids if is_ground(o)])
 
-    def height_at(self, x: ArrayLike, y: ArrayLike, z: ArrayLike = np.inf) -> Floats:
+    def height_below(self, x: ArrayLike, y: ArrayLike, z: ArrayLike = np.inf) -> Floats:
         """Height [m] of what is below points (x, y) [m], arrays of one shape or numbers; minus infinity: nothing.
 
         It is that of the highest ground, terrain (`heights`) or roof (the upper side of a `box`, turned or not), of
@@ -499,7 +499,7 @@ class Mission(Contents, Shown):
 
     def is_standing(self, r: Floats) -> Bools:
         """Which vehicles at r (N, 3) [m] stand on what is below them, (N,)."""
-        return r[:, 2] - self.fleet.radius - self.height_at(*r.T) <= _STANDING
+        return r[:, 2] - self.fleet.radius - self.height_below(*r.T) <= _STANDING
 
     def landing_swaps_in_words(self, end: Floats) -> str:
         """Which vehicles land where which other one stood, of those at ``end`` (N, 3) [m]; "" if none does."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rigidfleet.mission.losses import agent_rules, loss_time_rules
+from rigidfleet.mission.losses import agent_number_rules, loss_time_rules
 from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.schema import Network
 from rigidfleet.mission.vehicles import NOT_SAMPLED
@@ -23,7 +23,7 @@ def network_rules(m: Draft) -> Breaches:
     for key in ("late", "drift") if net.clocks else ():
         yield from m.one_per_agent_rules(net.clocks, key, "clocks", alone=", or a single number")
     for k, one in enumerate(net.outages):
-        yield from agent_rules(m, ("outages", k, "between"), one.between)
+        yield from agent_number_rules(m, ("outages", k, "between"), one.between)
         if one.end <= one.start:
             yield Breach(("outages", k, "end"), "is not after start", "give a later end")
     pairs = [tuple(sorted(one.between)) for one in net.lost]
@@ -32,7 +32,7 @@ def network_rules(m: Draft) -> Breaches:
         again = "is lost twice" if pair in pairs[:k] else ""
         if pair[0] == pair[1]:
             again = "joins an agent to itself"
-        yield from agent_rules(m, (*path, "between"), pair, again)
+        yield from agent_number_rules(m, (*path, "between"), pair, again)
         yield from loss_time_rules(m, net.lost[k].time, path)
     solver, kinds = m.constraint.solver, ("iterated", "exact")
     if solver not in kinds:

@@ -33,7 +33,7 @@ from rigidfleet.mission.kinds import (
     Turn,
     seconds,
 )
-from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key_rules
+from rigidfleet.mission.rules import Breach, Breaches, Draft, unused_key_rules
 from rigidfleet.mission.schema import Formation
 from rigidfleet.mission.values import AUTO
 
@@ -163,7 +163,7 @@ def _phase_time_rules(m: Draft, phases: Written, lengths: Lengths) -> Breaches:
             first = first + (shortest or 0.0) if first is not None else None
             last = last + (longest or 0.0) if last is not None else None
         lengths[k] = longest
-    yield from _sample_rules(m, last)
+    yield from _sample_count_rules(m, last)
 
 
 def _motion_time_rules(m: Draft, p: Phase, k: int, longest: float | None) -> Breaches:
@@ -172,7 +172,7 @@ def _motion_time_rules(m: Draft, p: Phase, k: int, longest: float | None) -> Bre
     if not m.is_valid(("phases", k), "reference", *_ENDINGS):
         return
     if p.shaping is not None and p.shaping.reference == "step":
-        yield from idle_key_rules(p, "blend", "reference", "shape")
+        yield from unused_key_rules(p, "blend", "reference", "shape")
     elif longest is None or p.follows_curves or not lasts > longest * (1 + 1e-9):
         return
     elif hasattr(p, "blend"):
@@ -183,7 +183,7 @@ def _motion_time_rules(m: Draft, p: Phase, k: int, longest: float | None) -> Bre
         yield Breach("travel", problem, "reduce travel or end the phase later", lasts)
 
 
-def _sample_rules(m: Draft, end: float | None) -> Breaches:
+def _sample_count_rules(m: Draft, end: float | None) -> Breaches:
     """A result has samples, and not too many."""
     step, n = m.output_step, m.n or 0
     if not end or not m.is_valid((), "output_step", "formations"):

@@ -34,7 +34,7 @@ class Breach(NamedTuple):
 Breaches = Iterator[Breach]
 
 
-def idle_key_rules(part: Any, key: str, other: str, *acts: str) -> Breaches:
+def unused_key_rules(part: Any, key: str, other: str, *acts: str) -> Breaches:
     """A key that is written has no effect but with one of some values of another key."""
     if key in part.model_fields_set and getattr(part, other) not in acts:
         problem = f"has no effect with {other} '{getattr(part, other)}'"

@@ -35,8 +35,8 @@ from rigidfleet.mission.obstacles import Sphere, is_ground
 from rigidfleet.planning.certificate import (
     CLOSE,
     Certificate,
-    certificate_in_step,
     certificate_of,
+    prove_straight_ways,
     prove_ways,
 )
 from rigidfleet.planning.clearance import greatest_shift
@@ -212,7 +212,7 @@ class Aborts:
         self.limits = limits_of(mission)
         rotors = not all(model.point for model in mission.vehicle_models or ())
         sinking = _SINKING if rotors else math.inf
-        self.home_limits = gentle_limits(
+        self.home_limits = capped_limits(
             mission, acceleration=BRAKING, jerk=JERK, speed=SPEED, vertical_speed=sinking
         )
         self.need, widest = limits.separation or 0.0, 2.0 * float(self.radius.max())
@@ -228,7 +228,7 @@ class Aborts:
         self.wrecked = np.flatnonzero(self.lost & falls_down)
         self.moves = any(x.solid.moves for x in mission.solids) or self.wrecked.size > 0
         start = mission.fleet.position
-        below = mission.height_at(*start.T) + ABOVE + self.radius
+        below = mission.height_below(*start.T) + ABOVE + self.radius
         self.stands = bool(mission.is_standing(start).all() and np.isfinite(below).all())
         self.start = np.column_stack([start[:, :2], below])
         self._known: dict[bytes, Home] = {}
@@ -331,7 +331,7 @@ class Aborts:
         """A step of ways that keep a separation, if they are so much off it [m]."""
         way = make()
         end = way.at(way.time[-1:])[0]
-        return Step(name, make, float(way.time[-1]), end, least, self._slack(way) + off, **how)
+        return Step(name, make, float(way.time[-1]), end, least, self._gap_loss(way) + off, **how)
 
     def slow_down(self, begins: float) -> tuple[Step, str]:
         """Slow down along the plan from a time on [s], in the least time that keeps the limits, or fly to its landing.
@@ -383,7 +383,7 @@ class Aborts:
         who, x = self.left, x.swapaxes(0, 1)[:, :, self.left]
         return np.array([(q.values(x, who) / q.most[who]).max() for q in limits])
 
-    def _slack(self, way: Piecewise) -> float:
+    def _gap_loss(self, way: Piecewise) -> float:
         """By how much nearer than on their way two vehicles may be in flight [m].
 
         Drag in proportion to the speed holds vehicles off their ways that fly differently, as tracking answers to it.
@@ -412,7 +412,7 @@ class Aborts:
         lands = name == "down"
         longest = float(np.linalg.norm(end - start, axis=1).max())
         time, _ = shortest_time(_FASTEST * longest / (DESCENT if lands else SPEED), limit_ratios)
-        least = certificate_in_step(start, end, time, self.radius, self.lost) or _APART_FOR_EVER
+        least = prove_straight_ways(start, end, time, self.radius, self.lost) or _APART_FOR_EVER
         return self._step(name, partial(_rest_to_rest, start, end, time), least, 0.0, lands=lands)
 
     def obstruction_in_words(self, step: Step, begin: float) -> str:
@@ -453,7 +453,7 @@ class Aborts:
                 return f"{who} are {height[k]:.2f} m above each other {on}"
         watch = BoundaryWatch(self.mission)
         if watch.every:
-            watch.take_way(way, ~self.lost)
+            watch.add_way(way, ~self.lost)
         for name, x in watch.search().items():
             q = QUANTITIES[name]
             limit, place = q.limit_of(self.mission), getattr(self.mission, PLACES[q.who])[x.other].name  # fmt: skip
@@ -581,7 +581,7 @@ class Aborts:
         k = np.arange(n)
         grid = np.column_stack([k % side, k // side]) - 0.5 * (side - 1)
         xy = r[self.left, :2].mean(axis=0) + 1.05 * apart * max(wide, 1.2) * grid
-        z = self.mission.height_at(*xy.T) + ABOVE + self.radius
+        z = self.mission.height_below(*xy.T) + ABOVE + self.radius
         return np.column_stack([xy, z])
 
     # -- aborts -------------------------------------------------------------------------------------------
@@ -668,7 +668,7 @@ class Aborts:
 
     # -- who does not hear --------------------------------------------------------------------------------
 
-    def nearness_if_not_heard(self, abort: Abort) -> list[Worst]:
+    def nearness_if_unheard(self, abort: Abort) -> list[Worst]:
         """How near each vehicle comes to another one if it does not hear the order and flies on, until the others rest.
 
         Distances between surfaces [m], at samples.
@@ -709,7 +709,7 @@ def shortest_time(
     return min(tries, key=lambda x: x[1].max())
 
 
-def gentle_limits(mission: Mission, **most: float) -> list[Limit]:
+def capped_limits(mission: Mission, **most: float) -> list[Limit]:
     """The limits of a mission, of which some are no greater than given here."""
     own = mission.limits
     less = {name: min(x, getattr(own, name) or x) for name, x in most.items()}
@@ -760,7 +760,7 @@ def phases_of(mission: Mission, steps: Sequence[Step], before: str = "") -> list
     return phases
 
 
-def state_to_leave(legs: Sequence[Leg], now: PhaseState) -> PhaseState:
+def plan_exit_state(legs: Sequence[Leg], now: PhaseState) -> PhaseState:
     """The state from which all vehicles leave a plan, each with the motion that it is led on.
 
     The virtual body is their mean and no longer turns; no formation outlasts it.

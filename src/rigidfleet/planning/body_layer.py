@@ -44,7 +44,7 @@ class Detour:
     scale: Floats = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))  # and two derivatives
 
     @property
-    def is_none(self) -> bool:
+    def is_zero(self) -> bool:
         """Whether there is none."""
         rest = self.scale - [1.0, 0.0, 0.0]
         return not (self.x.any() or self.omega.any() or rest.any() or self.rotation_vector.any())
@@ -93,7 +93,7 @@ class Detour:
         # In the axes of Q, in which the derivative of the rates is the same.
         own = self.omega @ self.Q
         Q = series.rotation_series_from_rates(self.Q, own)
-        return series.from_derivatives(self.x), Q, series.from_derivatives(self.scale)
+        return series.series_by_derivatives(self.x), Q, series.series_by_derivatives(self.scale)
 
 
 def least_norm_solution(G: Floats, h: Floats) -> Floats | None:

@@ -15,7 +15,7 @@ from rigidfleet.math import lqr, series, splines
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission.kinds import Orbit, Through, seconds
 from rigidfleet.mission.schema import Lqr, Tracking
-from rigidfleet.planning.derivatives import blend_series
+from rigidfleet.planning.derivatives import blend_taylor
 from rigidfleet.planning.reference import Pose
 from rigidfleet.typing import Floats
 
@@ -125,7 +125,7 @@ def rotation_to_pose(start: Pose, T1: Floats) -> Floats:
 
     Exp(phi) = T1 T^T, differentiated by the pose's body rates.
     """
-    omega = series.from_derivatives(np.stack([start.omega, start.alpha, start.alpha_dot]))
+    omega = series.series_by_derivatives(np.stack([start.omega, start.alpha, start.alpha_dot]))
     R = series.rotation_series_from_rates(start.T.T, omega)
     return series.derivatives(series.rotation_vector_series(T1 @ R))
 
@@ -156,7 +156,7 @@ def orbit_motion(
 
     def states(tau: Floats, carried: Floats) -> Floats:
         """CM and phi (K, 6) at times (K,) [s] from the start, and three derivatives, with what is ``carried``."""
-        s = blend_series(tau, 0.0, blend)[:4]
+        s = blend_taylor(tau, 0.0, blend)[:4]
         left, rho, turned = -s, (phase.radius - rho0) * s, np.zeros_like(s)
         left[0] += 1.0
         rho[0] += rho0

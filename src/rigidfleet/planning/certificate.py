@@ -49,19 +49,19 @@ def certificate_of(
     """
     if phase.control != "tracking" or (reference.T_b == 0.0 and reference.dp.any()):
         return None
-    return _prove_some(reference, radius, lost)
+    return _prove_flying(reference, radius, lost)
 
 
-def certificate_in_step(
+def prove_straight_ways(
     start: Floats, end: Floats, duration: float, radius: Floats, lost: Bools
 ) -> Certificate | None:
     """Certificate of straight septic blends (N, 3) [m] in step from 0 on [s]; the rest as `certificate_of`."""
     none, ways = np.zeros(0), end - start
     reference = Reference(SHAPE, 0.0, duration, none, none, start, ways, np.zeros(3))
-    return _prove_some(reference, radius, lost)
+    return _prove_flying(reference, radius, lost)
 
 
-def _prove_some(reference: Reference, radius: Floats, lost: Bools) -> Certificate | None:
+def _prove_flying(reference: Reference, radius: Floats, lost: Bools) -> Certificate | None:
     """Certificate of the slots of vehicles that are not ``lost`` (N,)."""
     left = np.flatnonzero(~lost)
     if len(left) < 2:

@@ -63,10 +63,10 @@ def _bounds(knots: Floats, ways: Floats, begin: Floats, end: Floats) -> tuple[Fl
         piece = np.minimum(first + k, last)
         low, high = (np.clip(t, knots[piece], knots[piece + 1]) for t in (begin, end))
         half = (high - low) / 2
-        x = series.of_polynomials(ways[piece], (low + high) / 2 - knots[piece], ways.shape[-1])
+        x = series.polynomial_series(ways[piece], (low + high) / 2 - knots[piece], ways.shape[-1])
         powers = half ** np.arange(float(len(x)))[:, None]
         far = (np.linalg.norm(x, axis=-1) * powers[..., None]).sum(axis=0)
-        fast = (np.linalg.norm(series.differentiate(x), axis=-1) * powers[:-1, :, None]).sum(axis=0)
+        fast = (np.linalg.norm(series.rate_series(x), axis=-1) * powers[:-1, :, None]).sum(axis=0)
         size, rate = np.maximum(size, far), np.maximum(rate, fast)
     return size, rate
 

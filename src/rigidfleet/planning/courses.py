@@ -77,10 +77,10 @@ class Course(NamedTuple):
 
 def course(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:
     """Course of the virtual body in a phase that ends at ``t_end`` [s], from a state with the frame attached."""
-    return _COURSES.get(phase.kind, _stay)(mission, phase, now, t_end)
+    return _COURSES.get(phase.kind, _stay_course)(mission, phase, now, t_end)
 
 
-def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:
+def _stay_course(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:
     """Come to rest at the previous goal, or the phase's own place; by the end, if known, as no time is given."""
     arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
     if now.goal is None:
@@ -90,9 +90,9 @@ def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Cour
     return _course_to(mission, phase, now, goal, arrival, t_end)
 
 
-def _reshape(mission: Mission, phase: Reshape, now: PhaseState, t_end: float) -> Course:
+def _reshape_course(mission: Mission, phase: Reshape, now: PhaseState, t_end: float) -> Course:
     """Stay, or go to the phase's own place; slots may go on bent ways."""
-    rest = _stay(mission, phase, now, t_end)
+    rest = _stay_course(mission, phase, now, t_end)
     if not phase.has_bent_ways:
         return rest
     control, blend = np.array(phase.control_points), seconds(phase.blend)
@@ -100,18 +100,18 @@ def _reshape(mission: Mission, phase: Reshape, now: PhaseState, t_end: float) ->
     return rest._replace(lift=Lift(control[-1] - control[0], blend, now.t + knots, ways, keeps=True))  # fmt: skip
 
 
-def _fly(mission: Mission, phase: Fly, now: PhaseState, t_end: float) -> Course:
+def _fly_course(mission: Mission, phase: Fly, now: PhaseState, t_end: float) -> Course:
     """Go to a waypoint, and perhaps an attitude."""
     velocity = np.zeros(3) if phase.has_free_velocity else np.array(phase.velocity)
-    return _steer(mission, phase, now, t_end, np.array(phase.position), velocity)
+    return _steer_course(mission, phase, now, t_end, np.array(phase.position), velocity)
 
 
-def _turn(mission: Mission, phase: Turn, now: PhaseState, t_end: float) -> Course:
+def _turn_course(mission: Mission, phase: Turn, now: PhaseState, t_end: float) -> Course:
     """Turn to an attitude on the spot."""
-    return _steer(mission, phase, now, t_end, now.pose_goal_slots[1].r, np.zeros(3))
+    return _steer_course(mission, phase, now, t_end, now.pose_goal_slots[1].r, np.zeros(3))
 
 
-def _steer(
+def _steer_course(
     mission: Mission, phase: Steering, now: PhaseState, t_end: float, r: Floats, v: Floats
 ) -> Course:
     """Go to a place (3,) with a velocity there and an attitude, within ``travel`` or by the end."""
@@ -124,7 +124,7 @@ def _steer(
     return _course_to(mission, phase, now, goal, arrival, t_end)
 
 
-def _orbit(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Course:
+def _orbit_course(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Course:
     """Fly a circle, and continue with its velocity. An attitude that turns along is not an explicitly specified one."""
     pose, goal, _ = now.pose_goal_slots
     motion = orbit_motion(phase, pose, goal.T, now.t, t_end, smooth=mission.smooth)
@@ -132,7 +132,7 @@ def _orbit(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Cou
     return Course(copy_with(pose_at(motion, t_end), named=named), t_end, lambda: motion)
 
 
-def _brake(mission: Mission, phase: Brake, now: PhaseState, t_end: float) -> Course:
+def _brake_course(mission: Mission, phase: Brake, now: PhaseState, t_end: float) -> Course:
     """Come to rest within ``travel`` or by the end, from the reference as it moves now."""
     pose, before, _ = now.pose_goal_slots
     arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
@@ -144,7 +144,7 @@ def _brake(mission: Mission, phase: Brake, now: PhaseState, t_end: float) -> Cou
     return Course(goal, arrival, lambda: motion)
 
 
-def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) -> Course:
+def _vertical_course(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) -> Course:
     """Go straight up or down by the mean of what the vehicles do, within ``travel`` or by the end.
 
     Where each vehicle has a way of its own, the slots follow the same septic from rest to rest: together, each goes
@@ -166,7 +166,7 @@ def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) 
     return Course(goal, arrival, partial(smooth_motion, pose, goal, now.t, arrival), lift)
 
 
-def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> Course:
+def _follow_course(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> Course:
     """Follow the trajectory of the virtual body, or the mean of the vehicles' own, about which the slots then move.
 
     What the first point of a file differs from the place where the vehicles are fades over `_FADED`; more, as avoidance
@@ -201,9 +201,9 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
             start[1:] = now.rates
         if begin[1:, 3:].any():
             # The slots take over the turn of the body: files that go on so are flown as they are.
-            turn = series.from_derivatives(np.stack([pose.omega, pose.alpha, pose.alpha_dot]))
+            turn = series.series_by_derivatives(np.stack([pose.omega, pose.alpha, pose.alpha_dot]))
             turn = series.rotation_series_from_rates(np.eye(3), turn).swapaxes(1, 2)
-            start = series.product(series.from_derivatives(start), turn, np.matmul)
+            start = series.product(series.series_by_derivatives(start), turn, np.matmul)
             start, begin[1:, 3:] = series.derivatives(start), 0.0
         own = Piecewise(knots, ways).start_from(start, fade)
         end = own.at(own.time[-1:])[0]
@@ -291,7 +291,7 @@ def _surface_heights_below(mission: Mission, now: PhaseState) -> Floats:
     """
     _, goal, slots = now.pose_goal_slots
     r = goal.r + slots @ goal.T
-    heights = mission.height_at(*r.T)
+    heights = mission.height_below(*r.T)
     if len(off := np.flatnonzero(~now.lost & ~np.isfinite(heights))):
         x, y, _ = r[off[0]]
         problem = f"needs a ground, and none is below agent {off[0] + 1} at ({x:.1f}, {y:.1f}) m"
@@ -336,12 +336,12 @@ def regulators(mission: Mission, phase: Phase | Steering) -> Lqr:
 
 #: Function of each kind of phase that leads somewhere; in all others, the virtual body comes to rest.
 _COURSES: dict[str, Callable[[Mission, Any, PhaseState, float], Course]] = {
-    "brake": _brake,
-    "fly": _fly,
-    "follow": _follow,
-    "land": _vertical,
-    "orbit": _orbit,
-    "reshape": _reshape,
-    "takeoff": _vertical,
-    "turn": _turn,
+    "brake": _brake_course,
+    "fly": _fly_course,
+    "follow": _follow_course,
+    "land": _vertical_course,
+    "orbit": _orbit_course,
+    "reshape": _reshape_course,
+    "takeoff": _vertical_course,
+    "turn": _turn_course,
 }

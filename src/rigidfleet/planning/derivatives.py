@@ -46,11 +46,11 @@ def slot_derivatives(
     """Position, velocity, acceleration, jerk and snap (K, 5, N, 3) [m, m/s, ...] of each slot, world axes.
 
     r_i = r_cm + T1^T Exp(phi) p_i, with slots p_i = Exp(s turn) (p0_i + s dp_i) or on their ways, as in the kernel's
-    `desired_agents` and `blend_slots`; at times (K,) [s] of a phase's problem with control "tracking". At a knot, the
-    piece after it counts. With fewer ``orders``, the last ones are left out.
+    `desired_positions` and `blend_slots`; at times (K,) [s] of a phase's problem with control "tracking". At a knot,
+    the piece after it counts. With fewer ``orders``, the last ones are left out.
     """
     derivatives = series.derivatives(
-        slot_series(reference, body_series(motion, time, orders), time)
+        slot_taylor(reference, body_taylor(motion, time, orders), time)
     )
     return derivatives.transpose(3, 0, 2, 1)
 
@@ -80,14 +80,14 @@ def slots_by_own_clocks(reference: Reference, motion: Motion, time: Floats, tau:
     return out
 
 
-def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats) -> Floats:
-    """Taylor series (5, 3, N, K) of each slot, from the `body_series` at times (K,) [s]; see `slot_derivatives`."""
+def slot_taylor(reference: Reference, body: tuple[Floats, Floats], time: Floats) -> Floats:
+    """Taylor series (5, 3, N, K) of each slot, from the `body_taylor` at times (K,) [s]; see `slot_derivatives`."""
     cm, axes = body
     if len(reference.knots):
         return (
-            series.product(way_series(reference, time)[: len(cm)], axes, _in_world) + cm[:, :, None]
+            series.product(way_taylor(reference, time)[: len(cm)], axes, _in_world) + cm[:, :, None]
         )
-    s = blend_series(time, reference.t0, reference.T_b)[: len(cm)]
+    s = blend_taylor(time, reference.t0, reference.T_b)[: len(cm)]
     if reference.turn.any():
         turned = series.rotation_series(s[..., None] * reference.turn).transpose(0, 2, 3, 1)
         axes = series.product(axes, turned, _matrix_product)
@@ -97,7 +97,7 @@ def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats)
     return slots + cm[:, :, None]
 
 
-def way_series(reference: Reference, time: Floats) -> Floats:
+def way_taylor(reference: Reference, time: Floats) -> Floats:
     """Taylor series (5, N, 3, K) of slots on their ways, body axes, at times (K,) [s]; at rest before and after."""
     ways = Piecewise(reference.knots, reference.ways)
     inside = np.clip(time, ways.time[0], ways.time[-1])
@@ -116,12 +116,12 @@ def _matrix_product(a: Floats, b: Floats) -> Floats:
     return (a[..., :, :, None, :] * b[..., None, :, :, :]).sum(axis=-3)
 
 
-def body_series(motion: Motion, time: Floats, orders: int = ORDERS) -> tuple[Floats, Floats]:
+def body_taylor(motion: Motion, time: Floats, orders: int = ORDERS) -> tuple[Floats, Floats]:
     """Taylor series (5, 3, K) [m] of the CM and (5, 3, 3, K) of the attitude, body to world, at times (K,) [s].
 
     Of a body that does not turn, the attitude has one time instead of K, and so nothing is multiplied K times. Fewer
     ``orders`` have the same numbers. After the last knot, the CM and the rotation vector continue at the rates they
-    have there. Times are the last axis, also in memory, here and in `slot_series`: arithmetic on long rows is fast.
+    have there. Times are the last axis, also in memory, here and in `slot_taylor`: arithmetic on long rows is fast.
     """
     way = Piecewise(motion.knots, motion.coefficients)
     inside = np.minimum(time, way.time[-1])
@@ -138,7 +138,7 @@ def body_series(motion: Motion, time: Floats, orders: int = ORDERS) -> tuple[Flo
     return cm, (motion.T1.T @ turned.reshape(orders, 3, -1)).reshape(turned.shape)
 
 
-def blend_series(time: Floats, t0: float, T_b: float) -> Floats:
+def blend_taylor(time: Floats, t0: float, T_b: float) -> Floats:
     """Taylor series (5, K) at times (K,) [s] of the blend s from 0 to 1 over [t0, t0 + T_b]; T_b = 0 is a step."""
     since = time - t0
     s = np.zeros((ORDERS, len(time)))
@@ -148,7 +148,7 @@ def blend_series(time: Floats, t0: float, T_b: float) -> Floats:
         x = since[under_way] / T_b
         powers = np.broadcast_to(_BLEND, (len(x), len(_BLEND)))
         scale = T_b ** -np.arange(ORDERS, dtype=float)
-        s[:, under_way] = series.of_polynomials(powers, x, ORDERS) * scale[:, None]
+        s[:, under_way] = series.polynomial_series(powers, x, ORDERS) * scale[:, None]
     return s
 
 
@@ -172,8 +172,8 @@ def yaw_derivatives(
     start : yaw (N,) [rad] at ``time[0]`` for "along"; by default the direction of the velocity there, or that of the
         body if a vehicle is at rest
     """
-    body = body_series(motion, time)
-    slots = slot_series(reference, body, time)
+    body = body_taylor(motion, time)
+    slots = slot_taylor(reference, body, time)
     if yaw.kind == "along":
         return yaw_along(reference, motion, time, slots, start)[0].transpose(2, 0, 1)
     return yaw_by_kind(body, slots, yaw).transpose(2, 0, 1)
@@ -182,7 +182,7 @@ def yaw_derivatives(
 def yaw_by_kind(body: tuple[Floats, Floats], slots: Floats, yaw: Yaw) -> Floats:
     """Yaw with two derivatives (3, N, K) of every kind but "along", see `yaw_derivatives`.
 
-    From the `body_series` and the `slot_series` at the same times.
+    From the `body_taylor` and the `slot_taylor` at the same times.
     """
     n, times = slots.shape[2:]
     angles = np.zeros((3, n, times))
@@ -212,8 +212,8 @@ def yaw_along(
     end = time[-1] if time[-1] > time[0] else time[0] + _STEP  # of a single time
     ends = np.unique(np.append(np.arange(time[0], end, _STEP), end))
     grid_time = np.concatenate([ends, 0.5 * (ends[:-1] + ends[1:])])
-    body = body_series(motion, grid_time)
-    on_grid = slot_series(reference, body, grid_time)
+    body = body_taylor(motion, grid_time)
+    on_grid = slot_taylor(reference, body, grid_time)
     if start is None:
         v = on_grid[1, :2, :, 0]
         from_body = yaw_by_kind(body, on_grid, Yaw())[0, :, 0]
@@ -243,7 +243,7 @@ def yaw_along(
 
 
 def _yaw_rate_terms(slots: Floats) -> tuple[Floats, Floats]:
-    """Terms A, B, C (3, N, K) of yaw' = A + B cos yaw + C sin yaw of kind "along", and their rates, from `slot_series`.
+    """Terms A, B, C (3, N, K) of yaw' = A + B cos yaw + C sin yaw of kind "along", and their rates, from `slot_taylor`.
 
     |v| - h . v becomes (|v|^2 - |v| h . v) / sqrt(|v|^2 + SLOW^2), which is smooth at rest.
     """

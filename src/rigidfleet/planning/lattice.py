@@ -47,7 +47,7 @@ class FreeSpace(NamedTuple):
     obstacles: Sequence[Obstacle]
     fence: Floats
 
-    def room_at(self, r: Floats, radius: Floats, most: Floats | float = np.inf) -> Floats:
+    def clearance(self, r: Floats, radius: Floats, most: Floats | float = np.inf) -> Floats:
         """Least distance (..., M) [m] of balls at r (..., M, 3) to an obstacle, or of their centres to the fence.
 
         Beyond ``most`` (..., M) [m] the distance does not matter.
@@ -155,7 +155,7 @@ class Lattice:
         self.layer, self.axes, self.shape = layer, axes, tuple(map(len, axes))
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         self.points = grid @ frame
-        self.room = space.room_at(self.points[:, None] + layer.offsets, radius, need).min(axis=1)
+        self.room = space.clearance(self.points[:, None] + layer.offsets, radius, need).min(axis=1)
         free = self.room >= need
         index = np.arange(len(grid)).reshape(self.shape)
         ends = ([np.delete(index, end, axis=k).ravel() for k in range(3)] for end in (-1, 0))
@@ -300,7 +300,7 @@ class Roadmap:
         places = [p if any(p is end for end in ends) else np.round(p, 3) for p, _ in stops]
         return Way(places, [k for _, k in stops], way.cost)
 
-    def _free(self, a: Stop, b: Stop) -> bool:
+    def _is_free(self, a: Stop, b: Stop) -> bool:
         """Whether the motion from one stop to another is proved: straight in one layer, or a change on the spot."""
         (p, i), (q, j) = a, b
         path, ways = constant_path(self.layers[i]), np.zeros(len(self.radius))
@@ -318,7 +318,9 @@ class Roadmap:
             run = k + 1
             while run + 1 < len(stops) and stops[run + 1][1] == stops[k][1]:
                 run += 1
-            far = next((j for j in range(run, k + 1, -1) if self._free(stops[k], stops[j])), k + 1)
+            far = next(
+                (j for j in range(run, k + 1, -1) if self._is_free(stops[k], stops[j])), k + 1
+            )
             del stops[k + 1 : far]
             k += 1
         return stops
@@ -334,7 +336,7 @@ class Roadmap:
                 a, b = stops[first - 1], stops[after]
                 for place in (a[0], b[0], np.round((a[0] + b[0]) / 2, 3)):
                     moved = [(place, layer) for _, layer in stops[first:after]]
-                    if all(self._free(x, y) for x, y in pairwise([a, *moved, b])):
+                    if all(self._is_free(x, y) for x, y in pairwise([a, *moved, b])):
                         stops[first:after] = moved
                         break
             first = after
@@ -348,7 +350,7 @@ class Roadmap:
             a, b = x.all_edges
             share = np.linspace(0.0, 1.0, 5)[1:-1]
             between = x.points[a, None] + share[:, None] * (x.points[b] - x.points[a])[:, None]
-            room = self.space.room_at(between[:, :, None] + x.layer.offsets, self.radius)
+            room = self.space.clearance(between[:, :, None] + x.layer.offsets, self.radius)
             ends = np.minimum(x.room[a], x.room[b])
             yield a + first[k], b + first[k], np.minimum(room.min(axis=(1, 2)), ends)
         for change in self.changes:
@@ -356,7 +358,7 @@ class Roadmap:
             room = np.minimum(one.room[a], two.room[b])
             yield a + first[change.before], b + first[change.after], room
 
-    def way_of_most_clearance(self, begin: Stop, end: Stop) -> tuple[float, Floats, int]:
+    def widest_way_bottleneck(self, begin: Stop, end: Stop) -> tuple[float, Floats, int]:
         """The most room [m] that a way between two nodes leaves everywhere, and place and layer where it is least."""
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree

@@ -22,14 +22,14 @@ from rigidfleet.mission.kinds import seconds
 from rigidfleet.mission.schema import Constraint
 from rigidfleet.planning.certificate import Certificate, certificate_of
 from rigidfleet.planning.courses import course
-from rigidfleet.planning.derivatives import body_series, slot_derivatives
+from rigidfleet.planning.derivatives import body_taylor, slot_derivatives
 from rigidfleet.planning.reference import (
     PhaseState,
     Pose,
-    align_slots,
     copy_with,
     pose_at,
     reference_kind,
+    slot_change,
 )
 from rigidfleet.typing import Floats
 
@@ -145,15 +145,15 @@ class Leg:
         """Time [s] at which the phase is expected to end: one that ends by settling, soon after it reaches its goal."""
         if self.phase.settle is None:
             return self.t_end
-        return self.start + settling_duration(self.phase, self.constraint, self._time_near_goal())
+        return self.start + settling_duration(self.phase, self.constraint, self._time_to_goal())
 
-    def _time_near_goal(self) -> float:
+    def _time_to_goal(self) -> float:
         """Time [s] from the start from which on the body is planned to be as near its goal as the phase asks for."""
         goal, settle = self.goal, self.phase.settle
         if goal is None or settle is None or self.way is None:
             return 0.0
         time = np.linspace(self.start, self.t_end, _LOOKS)
-        cm, axes = (x[0] for x in body_series(self.motion, time))
+        cm, axes = (x[0] for x in body_taylor(self.motion, time))
         off = np.linalg.norm(cm - goal.r[:, None], axis=0)
         turned = self.departure.p0 @ (axes - goal.T.T[..., None]).transpose(2, 1, 0)
         off += np.linalg.norm(turned, axis=2).max(axis=1, initial=0.0)
@@ -222,7 +222,7 @@ def depart(mission: Mission, phase: Phase, now: PhaseState) -> Departure:
         return Departure(now, state, frame, target, CONSTANT, p0, np.zeros(p0.shape), np.zeros(3))
     kind = _KINDS[reference_kind(mission, shaping, p0, target)]
     after, turn = (p0, np.eye(3)) if target is None else (target, turn)
-    return Departure(now, state, frame, target, kind, p0, *align_slots(p0, after, left, turn))
+    return Departure(now, state, frame, target, kind, p0, *slot_change(p0, after, left, turn))
 
 
 def _attach_frame(

@@ -59,7 +59,7 @@ def limits_of(
 ) -> list[Limit]:
     """The limits that a mission sets to its references, or other ``limits`` in place of its own.
 
-    With ``reserve`` (N,) [s], quantities are the greatest that vehicles reach (`planning.vehicles.overshoot_times`).
+    With ``reserve`` (N,) [s], quantities are the greatest that vehicles reach (`planning.vehicles.tracking_lag_times`).
     """
     limits, n = limits or mission.limits, mission.n_agents
     mass, up = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])

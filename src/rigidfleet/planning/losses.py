@@ -22,10 +22,10 @@ from rigidfleet.planning.abort import (
     JERK,
     SHORTEST,
     Aborts,
-    gentle_limits,
+    capped_limits,
     phases_of,
+    plan_exit_state,
     shortest_time,
-    state_to_leave,
 )
 from rigidfleet.planning.clearance import CLOSE, clearance_to, speed_bounds
 from rigidfleet.planning.courses import climb_heights, height_above_landing
@@ -80,15 +80,17 @@ def answer_to_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequenc
     plan : makes the legs of the mission from its start to its end, as far as they are known
     """
     if not mission.aborts:
-        return Answer(after_loss(mission, now, plan))
+        return Answer(loss_legs(mission, now, plan))
     legs = plan()
     abort = Aborts(mission, legs, now.lost).abort_at(now.t - mission.aborting.reaction)
     phases, least = phases_of(mission, abort.steps, "abort: "), abort.certificate.separation
     promise = least if abort.home.way and math.isfinite(least) else None
-    return Answer(legs_from(mission, state_to_leave(legs, now), phases), abort.home.reason, promise)
+    return Answer(
+        legs_from(mission, plan_exit_state(legs, now), phases), abort.home.reason, promise
+    )
 
 
-def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg]]) -> list[Leg]:
+def loss_legs(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg]]) -> list[Leg]:
     """The legs of the phases by which the others brake, and hold or land (`answer_to_loss`)."""
     d = mission.disturbances
     assert d is not None
@@ -98,7 +100,7 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
     def add_leg(make: Callable[[float], Phase], *, freely: bool = False) -> bool:
         """Add the leg of a phase; with ``freely``, only if it leads into nothing. Return whether it was added."""
         nonlocal now
-        leg = _shortest_leg(mission, now, make, SHORTEST)
+        leg = _quickest_leg(mission, now, make, SHORTEST)
         if freely and _hits_obstacle(mission, leg):
             return False
         legs.append(leg)
@@ -112,7 +114,7 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
         whole = plan()
         slow, *_ = Aborts(mission, whole, start.lost).slow_down(start.t)
         brake = phases_of(mission, [slow._replace(name="brake (loss)")])
-        legs = legs_from(mission, state_to_leave(whole, start), brake)
+        legs = legs_from(mission, plan_exit_state(whole, start), brake)
         now = legs[-1].planned_end_state
     if d.on_loss == "hold":
         until = phase_spans(mission)[-1][1] if d.hold_until is None else d.hold_until
@@ -141,7 +143,7 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
             return legs
         least = max(_PEAK_SPEED * depth / DESCENT, SHORTEST)
         least = max(math.sqrt(_PEAK_ACCELERATION * depth / _DESCENDING), least)
-        down = _shortest_leg(mission, now, lambda t, make=make: make(duration=t), least)
+        down = _quickest_leg(mission, now, lambda t, make=make: make(duration=t), least)
         if not _hits_obstacle(mission, down):
             break
     return [*legs, down]
@@ -154,14 +156,14 @@ def _hits_obstacle(mission: Mission, leg: Leg) -> bool:
     return any(x.clearance < -CLOSE for x in near)
 
 
-def _shortest_leg(
+def _quickest_leg(
     mission: Mission, now: PhaseState, make: Callable[[float], Phase], least: float
 ) -> Leg:
     """The leg of a phase of the shortest time from ``least`` [s] on, to within a tenth, that keeps the limits.
 
     Where the state at the start is beyond a limit, that counts as the limit. If no time keeps them, the best one tried.
     """
-    limits = gentle_limits(mission, acceleration=BRAKING, jerk=JERK)
+    limits = capped_limits(mission, acceleration=BRAKING, jerk=JERK)
     departure = depart(mission, make(least), now)
 
     def limit_shares(time: float, end: float = math.inf) -> Floats:

@@ -16,7 +16,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import rigid_body, series
 from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Shaping
-from rigidfleet.planning.derivatives import body_series
+from rigidfleet.planning.derivatives import body_taylor
 from rigidfleet.typing import Bools, Floats, Ints
 
 
@@ -94,7 +94,7 @@ class Pose:
 
 def pose_at(motion: Motion, t: float) -> Pose:
     """The pose of a reference motion at a time [s], with its acceleration and jerk."""
-    cm, axes = (x[..., 0] for x in body_series(motion, np.array([t])))
+    cm, axes = (x[..., 0] for x in body_taylor(motion, np.array([t])))
     r, v, a, jerk = series.derivatives(cm)[:4]
     omega, alpha, alpha_dot = series.derivatives(series.body_rates_series(axes))[:3]
     return Pose(r, v, axes[0].T, omega, a=a, jerk=jerk, alpha=alpha, alpha_dot=alpha_dot)
@@ -162,7 +162,7 @@ def reference_kind(
     return "squares" if same_hand else "shape"
 
 
-def align_slots(
+def slot_change(
     before: Floats, after: Floats, masses: Floats, turn: Floats | None = None
 ) -> tuple[Floats, Floats]:
     """What a blend adds to the slots, and the rotation vector by which it turns them at the same time.

@@ -22,7 +22,7 @@ from rigidfleet.planning.legs import Departure, Leg, depart, leg_from, state_at_
 from rigidfleet.planning.limits import Limit, Reached, limits_of, use_of_limits
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.transitions import expand_phases
-from rigidfleet.planning.vehicles import overshoot_times
+from rigidfleet.planning.vehicles import tracking_lag_times
 
 #: Shortest and longest time tried [s], and the number of times tried.
 _SHORTEST, _LONGEST, _TRIES = 0.1, 1e5, 60
@@ -56,7 +56,7 @@ def expand_mission(mission: Mission) -> Mission:
     return ways.find_ways(expand_phases(mission, timed_leg), timed_leg)
 
 
-def matters_to_plan(mission: Mission, keys: Keys) -> bool:
+def can_affect_plan(mission: Mission, keys: Keys) -> bool:
     """Whether `expand_mission` may depend on a key of a mission."""
     free = _IN_FLIGHT
     if mission.vehicle_models is None and all(p.settle is None for p in mission.phases):
@@ -129,7 +129,7 @@ def timed_leg(
     if not phase.auto_keys:
         return leg_from(mission, phase, departure)
     phase = _with_point_times(mission, phase, departure)
-    shortest, vary = _SHORTEST, partial(_with_travel, phase)
+    shortest, vary = _SHORTEST, partial(_with_travel_time, phase)
     if phase.duration == AUTO and phase.shaping is not None and phase.shaping.blend != AUTO:
         shortest = phase.shaping.least_time
         vary = lambda t: phase.model_copy(update={"duration": t})  # noqa: E731
@@ -150,7 +150,7 @@ def least_time(mission: Mission, leg: Leg) -> tuple[str, float | None]:
     """
     length = {"until": None, "settle": None, "duration": leg.end - leg.start}
     phase = _with_point_times(mission, leg.phase.model_copy(update=length), leg.departure)
-    time, _ = _min_time(mission, partial(_with_travel, phase), leg.departure, _SHORTEST)
+    time, _ = _min_time(mission, partial(_with_travel_time, phase), leg.departure, _SHORTEST)
     return phase.time_key, time
 
 
@@ -182,7 +182,7 @@ def _min_time(
 
     Vehicles leave a reserve of their limits, unless no time does: of a circle near a limit, for example.
     """
-    if limits is None and (reserve := overshoot_times(mission)).any():
+    if limits is None and (reserve := tracking_lag_times(mission)).any():
         fastest = _min_time(mission, vary, departure, shortest, limits_of(mission, reserve=reserve))
         if fastest[0] is not None:
             return fastest
@@ -217,7 +217,7 @@ def _min_time(
     return high, worst
 
 
-def _with_travel(phase: Phase, time: float) -> Phase:
+def _with_travel_time(phase: Phase, time: float) -> Phase:
     """A phase whose motion takes a time [s]; it does not end before."""
     key = phase.time_key
     times: dict[str, Any] = {key: time}

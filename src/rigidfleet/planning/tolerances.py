@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _STALLED, _STALLED_RATE, _MOST_STEPS = 50_000, 2_000.0, 5_000_000
 
 
-def most_steps(flown: float) -> int:
+def step_limit(flown: float) -> int:
     """Greatest number of steps of a phase after ``flown`` [s]: far more than this duration explains."""
     return int(min(_STALLED + _STALLED_RATE * flown, _MOST_STEPS))
 

@@ -23,10 +23,10 @@ from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import VehicleModel
 from rigidfleet.planning.derivatives import (
     Yaw,
-    blend_series,
-    body_series,
+    blend_taylor,
+    body_taylor,
     slot_derivatives,
-    slot_series,
+    slot_taylor,
     yaw_along,
     yaw_by_kind,
     yaw_derivatives,
@@ -112,7 +112,7 @@ def vehicle_lags(mission: Mission) -> list[Lag]:
     ]
 
 
-def overshoot_times(mission: Mission) -> Floats:
+def tracking_lag_times(mission: Mission) -> Floats:
     """Times T (N,) [s] by which a vehicle leaves its reference at most (`margins.tracking_error_gain`); 0 for points.
 
     Its acceleration differs by up to T times the reference's greatest jerk, its velocity by up to T times the greatest
@@ -196,8 +196,8 @@ def network_of(mission: Mission) -> Links:
     net, n, rate = mission.network, mission.n_agents, mission.autopilot.rate
     if net is None:
         return no_network(n)
-    links, reverse = links_of(mission.edges)
-    worsens, recovers = loss_transitions(net.loss, net.burst)
+    links, reverse = directed_links(mission.edges)
+    worsens, recovers = gilbert_transitions(net.loss, net.burst)
     every, jitter = max(1, round(rate / net.broadcast_rate(n))), round(net.jitter * rate)
     delay, silence = max(1, round(net.delay * rate)), max(1, round(net.silence * rate))
     # As many messages within the time of silence as are all lost once in a thousand times, and two at least.
@@ -227,13 +227,13 @@ def network_of(mission: Mission) -> Links:
     )
 
 
-def links_of(edges: Ints) -> tuple[Ints, Ints]:
+def directed_links(edges: Ints) -> tuple[Ints, Ints]:
     """Links (L, 2) both ways along edges (m, 2), sorted, and of each (L,) the one that leads back."""
     links = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0).astype(np.int64)
     return links, np.lexsort(links.T)
 
 
-def loss_transitions(loss: float, burst: float | None) -> tuple[float, float]:
+def gilbert_transitions(loss: float, burst: float | None) -> tuple[float, float]:
     """Probabilities with which a link begins and ends to lose messages, by the share lost and the mean burst.
 
     In a chain of two states, bursts of mean length L end with 1/L, and the share of the bad state is the loss.
@@ -284,7 +284,7 @@ class TickTables:
         #: Where the yaw "along" of a turn is known from, to continue from table to table: time [s], yaw (N,).
         self._known: tuple[YawTurn, float, Floats] | None = None
 
-    def start_path(
+    def switch_path(
         self, problem: Problem, tick: int, tables: fleet.TickInputs, tau: Floats | None = None
     ) -> Floats:
         """Begin to measure states about another path; return where the one before is (N, 6), by its ``tables``.
@@ -338,11 +338,11 @@ class TickTables:
         slots, path = np.zeros(0), np.zeros((0, self.n, 6))
         if not self.flight.vehicles.point.all() or self.yaw.kind == "along":
             # An ideal point has no attitude that goes ahead of its force.
-            yaw, slots = self._references(problem, ticks / self.rate, turn)
+            yaw, slots = self._yaw_slots(problem, ticks / self.rate, turn)
             if len(slots):
                 jerk, snap = self._force_rates(slots)
         if self.compensated:
-            path = _by_tick(slots[:2].reshape(6, self.n, -1)) if len(slots) else self._path(ticks)
+            path = _tick_rows(slots[:2].reshape(6, self.n, -1)) if len(slots) else self._path(ticks)
         noise_r = noise_v = np.zeros((0, self.n, 3))
         dropped = np.zeros((0, self.n), dtype=np.bool_)
         if self.noise is not None:
@@ -370,9 +370,9 @@ class TickTables:
         """Yaw and its rate (2, N) [rad, rad/s] asked of each vehicle at a time [s] of a phase."""
         if t <= turn.begun:
             return turn.start
-        return self._references(problem, np.array([t]), turn)[0][0, :, :2].T
+        return self._yaw_slots(problem, np.array([t]), turn)[0][0, :, :2].T
 
-    def _references(self, problem: Problem, time: Floats, turn: YawTurn) -> tuple[Floats, Floats]:
+    def _yaw_slots(self, problem: Problem, time: Floats, turn: YawTurn) -> tuple[Floats, Floats]:
         """Yaw with two derivatives (K, N, 3) of each vehicle at times (K,) [s], and derivatives (5, 3, N, K) of slots.
 
         A vehicle turns with the formation, or from its yaw at the start of the phase into the one asked for.
@@ -391,7 +391,7 @@ class TickTables:
         )
         if known is not None:
             self._known = turn, *known
-        return _by_tick(turned[..., 1:]), series.derivatives(slots[..., 1:])
+        return _tick_rows(turned[..., 1:]), series.derivatives(slots[..., 1:])
 
     def _force_rates(self, x: Floats) -> tuple[Floats, Floats]:
         """Two derivatives (K, N, 3) of the desired force per mass, from those of the reference, (5, 3, N, K).
@@ -409,7 +409,7 @@ class TickTables:
             curve = ((a * a + v * j).sum(axis=0) - faster**2) / speed
             jerk += c * (speed * a + faster * v)
             snap += c * (speed * j + 2.0 * faster * a + curve * v)
-        return _by_tick(jerk), _by_tick(snap)
+        return _tick_rows(jerk), _tick_rows(snap)
 
 
 def commanded_yaw(mission: Mission) -> Yaw:
@@ -463,13 +463,13 @@ def slots_and_yaw(
     Yaw "along" continues from ``turn.start`` at ``time[0]``; it is known at the time returned beside (see `yaw_along`).
     A rate that differs at first, as that of a body that turns no more, fades as tau (1 - s), with the blend s.
     """
-    body = body_series(motion, time)
-    slots = slot_series(reference, body, time)
+    body = body_taylor(motion, time)
+    slots = slot_taylor(reference, body, time)
     if yaw.kind == "along":
         return slots, *yaw_along(reference, motion, time, slots, turn.start[0])
     turned = yaw_by_kind(body, slots, yaw)
     turned[0] += turn.off[0, :, None]
-    done = blend_series(time, turn.begun, _TURN_TIME)[:3]
+    done = blend_taylor(time, turn.begun, _TURN_TIME)[:3]
     if yaw.kind != "formation":
         turned -= series.derivatives(done)[:, None] * turn.off[0, :, None]
     if turn.off[1].any():
@@ -479,7 +479,7 @@ def slots_and_yaw(
     return slots, turned, None
 
 
-def _by_tick(x: Floats) -> Floats:
+def _tick_rows(x: Floats) -> Floats:
     """A table (K, N, Q) of values (Q, N, K)."""
     return np.ascontiguousarray(x.T)
 

@@ -315,7 +315,7 @@ class _Search:
                     f" than {self.phase.clearance:g} m"
                 )
                 return mistake(problem, "move it, or ask for less clearance")
-        least, place, layer = roadmap.way_of_most_clearance((self.begin, 0), (self.end, self._last))
+        least, place, layer = roadmap.widest_way_bottleneck((self.begin, 0), (self.end, self._last))
         x, (_, _, thing) = roadmap.layers[layer], self._least_gap(roadmap, place, layer)
         where = ", ".join(f"{v:z.2f}" for v in place)
         problem = (
@@ -331,7 +331,7 @@ class _Search:
     def _least_gap(self, roadmap: Roadmap, place: Floats, layer: int) -> tuple[float, int, str]:
         """The least room [m] of an agent at a place, the agent, and what is nearest to it."""
         r, space = place + roadmap.layers[layer].offsets, roadmap.space
-        room = space.room_at(r, roadmap.radius)
+        room = space.clearance(r, roadmap.radius)
         _, near = proximity.obstacle_clearances(r, roadmap.radius, space.obstacles)
         agent = int(room.argmin())
         thing = f"'{space.obstacles[near[agent]].name}'" if near[agent] >= 0 else "the geofence"

@@ -72,7 +72,7 @@ def fall_places_by_sample(result: Result) -> Floats:
     return Boundaries(result.mission).ends_of_falls(result.position, result.velocity)[..., :2]
 
 
-@st.figure_of()
+@st.styled_figure()
 def draw_ground(result: Result, falls: Floats) -> Figure:
     """The ground from above: fences, people, and where vehicles fly and fall (`fall_places_by_sample`)."""
     from matplotlib.patches import Patch

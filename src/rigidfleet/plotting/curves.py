@@ -139,7 +139,7 @@ def has_edges(result: Result) -> bool:
     return len(result.edges) > 0
 
 
-@st.figure_of(has_edges, "no edges")
+@st.styled_figure(has_edges, "no edges")
 def distances(result: Result) -> Figure:
     """Distances of the active edges, with their references (dashed)."""
     fig, axes = st.time_figure(result, "Distances between agents", 1, height=3.4)
@@ -174,7 +174,7 @@ def _draw_components(result: Result, axes: Any, column: _Column) -> None:
 
 def fit_to_variation(ax: Axes, values: Floats, unit: str) -> None:
     """Note the value if it does not vary; else choose limits so that rounding errors do not fill the axes."""
-    if not st.note_if_still(ax, values, unit):
+    if not st.note_if_constant(ax, values, unit):
         _widen_limits(ax, 0.1)
 
 
@@ -195,7 +195,7 @@ def _waypoint_values(result: Result, key: str) -> list[tuple[float, Any]]:
 def _body_figure(result: Result, title: str, *columns: _Column) -> Figure:
     """Components of the body's state in rows, lower ones where nothing changes; each column beside the other."""
     still = [
-        all(st.is_still(np.stack([f[:, i], w[:, i]])) for f, w, *_ in columns) for i in range(3)
+        all(st.is_constant(np.stack([f[:, i], w[:, i]])) for f, w, *_ in columns) for i in range(3)
     ]
     shares = [_STILL_ROW if x else 1.0 for x in still]
     fig, axes = st.time_figure(result, title, 3, len(columns), height=1.5, shares=shares)
@@ -208,7 +208,7 @@ def _body_figure(result: Result, title: str, *columns: _Column) -> Figure:
     return fig
 
 
-@st.figure_of()
+@st.styled_figure()
 def cm(result: Result) -> Figure:
     """Centre of mass: flown, reference (dashed) and waypoints (rings)."""
     places, speeds = _waypoint_values(result, "position"), _waypoint_values(result, "velocity")
@@ -225,7 +225,7 @@ def euler_deg(quaternions: Floats) -> Floats:
     return np.degrees(angles)
 
 
-def _nearest_turn(angles: Floats, to: Floats) -> Floats:
+def _unwrap_near(angles: Floats, to: Floats) -> Floats:
     """Angles [deg] shifted by full turns to lie near the angles ``to``, where both are known."""
     shift = np.round((to - angles) / 360.0) * 360.0
     return angles + np.where(np.isfinite(shift), shift, 0.0)
@@ -234,11 +234,11 @@ def _nearest_turn(angles: Floats, to: Floats) -> Floats:
 def flown_and_wanted_euler(result: Result) -> tuple[Floats, Floats, list[tuple[float, Floats]]]:
     """Euler angles [deg] flown and commanded (K, 3), and those of waypoints (time, (3,))."""
     flown = euler_deg(result.attitude)
-    wanted = _nearest_turn(euler_deg(result.attitude_reference), flown)
+    wanted = _unwrap_near(euler_deg(result.attitude_reference), flown)
     targets = []
     for t, q in _waypoint_values(result, "attitude"):
         k = int(np.abs(result.time - t).argmin())
-        targets.append((t, _nearest_turn(euler_deg(np.array([q], dtype=float)), flown[[k]])[0]))
+        targets.append((t, _unwrap_near(euler_deg(np.array([q], dtype=float)), flown[[k]])[0]))
     return flown, wanted, targets
 
 
@@ -247,7 +247,7 @@ def has_attitude(result: Result) -> bool:
     return bool(np.isfinite([result.attitude, result.attitude_reference]).any())
 
 
-@st.figure_of(has_attitude, "no body frame attached")
+@st.styled_figure(has_attitude, "no body frame attached")
 def attitude(result: Result) -> Figure:
     """Attitude of the formation: flown, reference (dashed) and waypoints (rings)."""
     flown, wanted, targets = flown_and_wanted_euler(result)
@@ -275,7 +275,7 @@ def draw_thrust(ax: Axes, result: Result) -> None:
     panel.draw(distinct_limits(result.mission.fleet.thrust_limit), always=False)
 
 
-@st.figure_of(has_thrust, "forces are not known")
+@st.styled_figure(has_thrust, "forces are not known")
 def inputs(result: Result) -> Figure:
     """Thrust of each vehicle with its limit, and enlarged."""
     fig, axes = st.time_figure(result, "Thrust of each agent", 2)
@@ -283,7 +283,7 @@ def inputs(result: Result) -> Figure:
     draw_thrust(above, result)
     st.draw_agent_lines(below, result, result.thrust)
     below.set_ylabel("enlarged [N]")
-    if not st.note_if_still(below, result.thrust, "N"):
+    if not st.note_if_constant(below, result.thrust, "N"):
         panel = Panel(below, result, result.thrust, "N", result.extreme("thrust"))
         panel.leave_out_final_peak()
         _widen_limits(below, min(0.1, 0.1 * peak_before_breakdown(result, result.thrust)))
@@ -292,7 +292,7 @@ def inputs(result: Result) -> Figure:
     return fig
 
 
-@st.figure_of(has_edges, "no edges")
+@st.styled_figure(has_edges, "no edges")
 def constraint_force(result: Result) -> Figure:
     """Constraint force on each vehicle, and tension of each edge (negative: the edge pushes)."""
     force, tension = np.linalg.norm(result.constraint_force, axis=2), -result.multiplier
@@ -315,7 +315,7 @@ def constraint_force(result: Result) -> Figure:
     return fig
 
 
-@st.figure_of(lambda result: result.disturbance_force is not None, "still air")
+@st.styled_figure(lambda result: result.disturbance_force is not None, "still air")
 def disturbance(result: Result) -> Figure:
     """Aerodynamic force on each vehicle, and distance of each vehicle from its slot."""
     fig, axes = st.time_figure(result, "Aerodynamic force, and distance from the slots", 2)
@@ -385,7 +385,7 @@ def draw_constraint_error(ax: Axes, result: Result) -> list[Line2D]:
     return handles
 
 
-@st.figure_of(lambda result: has_edges(result) or result.mission.formations)
+@st.styled_figure(lambda result: has_edges(result) or result.mission.formations)
 def constraint_error(result: Result) -> Figure:
     """Constraint error |c| of each edge (length minus reference), and shape error of all pairs."""
     title = "Constraint error, and shape error of all pairs against the slots"
@@ -466,7 +466,7 @@ def _names_of_least_distances(result: Result) -> list[str]:
     return [name for name in there if there[name]]
 
 
-@st.figure_of(_names_of_least_distances, "only one agent, and nothing near it")
+@st.styled_figure(_names_of_least_distances, "only one agent, and nothing near it")
 def clearance(result: Result) -> Figure:
     """Distances between surfaces, with the limits."""
     names = _names_of_least_distances(result)
@@ -485,7 +485,7 @@ def limited_motions(result: Result) -> list[Quantity]:
     return [q for q in MOTIONS if q.limit_of(result.mission) is not None]
 
 
-@st.figure_of(limited_motions)
+@st.styled_figure(limited_motions)
 def motion(result: Result) -> Figure:
     """Speed, acceleration and jerk of each vehicle, as far as they are limited, with their limits."""
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]

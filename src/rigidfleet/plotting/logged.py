@@ -91,7 +91,7 @@ def vehicle_names_in_log(result: Result) -> list[str]:
     return [st.clean_name(x) for x in result.statistics["names"]]
 
 
-@st.figure_of(lambda result: "bands" in result.statistics, "no log against a plan")
+@st.styled_figure(lambda result: "bands" in result.statistics, "no log against a plan")
 def plan_and_flight(result: Result) -> Figure:
     """The plan (dashed) and the flight from above, and how far vehicles are from their slots, with what is in doubt."""
     fig = st.blank_figure(st.WIDTH, 3.9, "constrained")

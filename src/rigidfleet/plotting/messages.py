@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _DIVERGES = 1e4
 
 
-@st.figure_of(
+@st.styled_figure(
     lambda result: result.message_age is not None and result.message_age.size,
     "no network: one law knows all states",
 )

@@ -22,7 +22,7 @@ def leaves_ground(result: Result) -> bool:
     return any(phase.vertical is not None for phase in result.mission.phases)
 
 
-@st.figure_of(leaves_ground)
+@st.styled_figure(leaves_ground)
 def operation(result: Result, agents: Sequence[int] = ()) -> Figure:
     """Altitude and speeds of all vehicles, their least separation, and their clearance to obstacles.
 

@@ -44,7 +44,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
 
 
 # Of trajectories that others made, most panels would be empty.
-@st.figure_of(lambda x: curves.has_edges(x) or curves.has_thrust(x) or curves.has_attitude(x))
+@st.styled_figure(lambda x: curves.has_edges(x) or curves.has_thrust(x) or curves.has_attitude(x))
 def summary(result: Result) -> Figure:
     """Summary of the flight on one page.
 

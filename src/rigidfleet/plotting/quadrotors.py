@@ -54,7 +54,7 @@ def _rotor_nearest_to_limit(result: Result, limits: Floats) -> Extremum | None:
     return max(every, key=lambda x: x.value / limits[x.who], default=None)
 
 
-@st.figure_of(has_rotors, "no rotors")
+@st.styled_figure(has_rotors, "no rotors")
 def rotors(result: Result) -> Figure:
     """Greatest force of a rotor of each vehicle as a share of its limit; all rotors of the one nearest to its limit."""
     fig, axes = st.time_figure(result, "Force of the rotors", 2)
@@ -97,7 +97,7 @@ def _draw_rotors_of_nearest(ax: Axes, result: Result) -> None:
     st.draw_legend(ax, entries, "nearest to its limit")
 
 
-@st.figure_of(has_rotors, "no rotors")
+@st.styled_figure(has_rotors, "no rotors")
 def vehicles(result: Result) -> Figure:
     """Tilt of each vehicle, its distance from its slot, and when it is asked for more than its rotors give."""
     saturated = np.zeros(result.left.shape, dtype=np.bool_)

@@ -12,7 +12,7 @@ from rigidfleet.formation import distance_geometry
 from rigidfleet.plotting import curves
 from rigidfleet.plotting import style as st
 from rigidfleet.result import Result
-from rigidfleet.result.lights import camera_axes, plane_view
+from rigidfleet.result.lights import camera_axes, view_angles
 from rigidfleet.solids.distance import vector_from_segment
 from rigidfleet.typing import Floats
 
@@ -58,7 +58,7 @@ def tiled_figure(n: int, above: float, below: float) -> tuple[Figure, list[Axes]
     return fig, axes.ravel().tolist()[:n]
 
 
-@st.figure_of(lambda result: result.mission.formations, "the mission has no formation")
+@st.styled_figure(lambda result: result.mission.formations, "the mission has no formation")
 def formations(result: Result) -> Figure:
     """Formations with their edges and body axes."""
     names = list(result.mission.formations)
@@ -116,7 +116,7 @@ def draw_formation_sketch(
     flat = thin and distance_geometry.dimension(p, 1e-3) < 3
     turn, lit = np.eye(3), mission.formation_colours(name)
     if lit:
-        turn = camera_axes(*plane_view(p))
+        turn = camera_axes(*view_angles(p))
     elif sideways or not flat:
         turn = camera_axes(*np.radians([-70.0, 30.0 if flat else 16.0]))
     words += "" if placed else "; their distances fix no positions"

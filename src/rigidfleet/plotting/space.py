@@ -315,7 +315,7 @@ def trajectory_handles(result: Result, view: Scene) -> list[Any]:
     return [*st.agent_handles(result.n_agents, marker="o", markersize=4), *ends, *waypoints]
 
 
-@st.figure_of()
+@st.styled_figure()
 def trajectory(result: Result) -> Figure:
     """Paths of the vehicles, and the formation at selected times."""
     wide = st.figure_width(10.5)

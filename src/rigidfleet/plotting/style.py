@@ -83,7 +83,7 @@ def apply_style() -> Generator[None]:
         yield
 
 
-def figure_of(
+def styled_figure(
     there: Callable[[Result], object] = bool, nothing: str = ""
 ) -> Callable[[Draw], Draw]:
     """Draw a figure in our style; where what it shows is not there, say that there is ``nothing``, if that is given."""
@@ -272,10 +272,10 @@ def write_above(ax: Axes, words: str, colour: str = INK) -> None:
     )  # fmt: skip
 
 
-def note_if_still(ax: Axes, values: Floats, unit: str) -> bool:
+def note_if_constant(ax: Axes, values: Floats, unit: str) -> bool:
     """If values do not vary, write the value into the axes; return whether this is so."""
     known = values[np.isfinite(values)]
-    if not len(known) or not is_still(known):
+    if not len(known) or not is_constant(known):
         return False
     value = round(float(known.max() + known.min()) / 2, 3) + 0.0
     off = float(np.abs(known - value).max())
@@ -286,7 +286,7 @@ def note_if_still(ax: Axes, values: Floats, unit: str) -> bool:
     return True
 
 
-def is_still(values: Floats) -> bool:
+def is_constant(values: Floats) -> bool:
     """Whether all known values are the same, or none is known."""
     known = values[np.isfinite(values)]
     return not len(known) or float(np.ptp(known)) <= STILL

@@ -52,12 +52,12 @@ class AbortsCheck(Shown):
             text += f"; no two vehicles come nearer than {self.least_separation:.2f} m"
         to = "any place" if options.to == "any" else "their own places"
         parts = [
-            FactTable(heads, [*self._rows_of_runs()], ("way home", "one that does not hear")),
+            FactTable(heads, [*self._abort_rows()], ("way home", "one that does not hear")),
             Line(text, "ok" if ways == all_ else "note"),
         ]
         return Sheet(name, f"aborts, {options.reaction:g} s after each order, to {to}", parts)
 
-    def _rows_of_runs(self) -> Iterator[Row]:
+    def _abort_rows(self) -> Iterator[Row]:
         both = zip(self.aborts, self.unheard, strict=True)
         for _, group in itertools.groupby(
             both, lambda x: re.sub(r"[\d.]+", "#", x[0].home.way or x[0].home.reason)
@@ -162,5 +162,5 @@ def check_aborts(
     for abort in aborts.all_aborts():
         progress(f"way home from {abort.ordered:g} s")
         every.append(abort)
-        unheard.append(aborts.nearness_if_not_heard(abort))
+        unheard.append(aborts.nearness_if_unheard(abort))
     return AbortsCheck(mission, every, unheard)

@@ -23,7 +23,7 @@ def braking_remarks(mission: Mission) -> Iterator[Remark]:
     if mission.avoidance is None or not mission.avoidance.guard:
         return
     from rigidfleet.kernel.moving import way_to_rest
-    from rigidfleet.kernel.segments import segment_distance, segment_to_obstacle
+    from rigidfleet.kernel.segments import segment_distance, segment_obstacle_distance
     from rigidfleet.planning.avoidance import avoidance_in_flight
     from rigidfleet.planning.vehicles import sampled_flight
 
@@ -42,7 +42,7 @@ def braking_remarks(mission: Mission) -> Iterator[Remark]:
             if room < worst:
                 worst, who = room, f"agents {j + 1} and {i + 1}"
         for o in np.flatnonzero(a.sight.moves == 0):
-            nearest = segment_to_obstacle(r[i], stop[i], o, a.solids, np.nan, a.normal)
+            nearest = segment_obstacle_distance(r[i], stop[i], o, a.solids, np.nan, a.normal)
             if nearest[0] - a.reach[i] < worst:
                 worst = nearest[0] - a.reach[i]
                 who = f"agent {i + 1} and '{mission.obstacles[o].name}'"

@@ -15,7 +15,7 @@ from rigidfleet.mission import Mission, as_mission
 from rigidfleet.mission.files import notes_on_files
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview_phases, samples_per_phase
 from rigidfleet.planning.timing import complete_times
-from rigidfleet.planning.vehicles import overshoot_times, vehicle_lags
+from rigidfleet.planning.vehicles import tracking_lag_times, vehicle_lags
 from rigidfleet.preflight import trajectory
 from rigidfleet.preflight.assignment import assignment_remarks
 from rigidfleet.preflight.avoidance import braking_remarks
@@ -66,7 +66,7 @@ def check(
         preflight.margins = check_margins(mission, planned, lags)
         preflight.network = check_network(mission, planned, lags)
         preflight.vehicles = check_vehicles(mission, planned)
-        preflight.reserve = float(overshoot_times(mission).max()) if mission.smooth else 0.0
+        preflight.reserve = float(tracking_lag_times(mission).max()) if mission.smooth else 0.0
     progress("collisions, obstacles and limits")
     preflight.remarks = [
         *(Remark("note", "files", text) for text in notes_on_files(mission.file_digests_text)),

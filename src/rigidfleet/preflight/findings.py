@@ -327,7 +327,7 @@ class Preflight(Shown):
     margins : what lag and delay the laws bear; None if vehicles have none
     network : what delay and loss of messages each formation bears, by its name; empty without a network
     vehicles : what the planned paths ask of rotors; None if vehicles have none
-    reserve : of the limits, what automatic times leave for lag and drag of vehicles [s] (`vehicles.overshoot_times`)
+    reserve : of the limits, what automatic times leave for lag and drag of vehicles [s] (`vehicles.tracking_lag_times`)
     judged_to : mission time [s] up to which paths were checked; infinite if they all were
     remarks : problems and notes
 
@@ -460,10 +460,10 @@ class Preflight(Shown):
     def _headed_sentences(self) -> Iterator[tuple[str, str]]:
         """What is said in words, each with its heading."""
         if self.is_show:
-            yield from ((f.name, words) for f in self.formations if (words := _scene_words(f)))
+            yield from ((f.name, words) for f in self.formations if (words := _show_notes_text(f)))
         lacking = [p.phase for p in self.planned_phases if p.leg.certificate is None]
         if lacking and self.certificates:
-            yield "not proved", f"{names_in_words(lacking)} flown without tracked slots"
+            yield "not proved", f"{names_with_verb(lacking)} flown without tracked slots"
         guessed = [planned.phase for planned in self.planned_phases if not planned.exact]
         if guessed:
             names = ", ".join(f"'{name}'" for name in guessed)
@@ -512,7 +512,7 @@ class Preflight(Shown):
         return to_json_data(data)
 
 
-def _scene_words(f: FormationCheck) -> str:
+def _show_notes_text(f: FormationCheck) -> str:
     """What concerns a formation of a show, besides its spacing."""
     parts = ["not used in any phase"] if f.held_by == "nothing" else []
     parts += [f"{f.colours} colour{'s' * (f.colours > 1)} of lights"] if f.colours else []
@@ -586,7 +586,7 @@ def _margin_row(where: str, m: Margins) -> dict[str, Any]:
     return row
 
 
-def names_in_words(names: Sequence[str]) -> str:
+def names_with_verb(names: Sequence[str]) -> str:
     """First names, the number of the others, and "is" or "are"."""
     text = first_few([f"'{name}'" for name in names], _TOLD)
     return f"{text} {'is' if len(names) == 1 else 'are'}"

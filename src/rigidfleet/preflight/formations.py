@@ -18,7 +18,7 @@ from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
 from rigidfleet.planning.reference import reference_kind
-from rigidfleet.preflight.findings import DENSE, FormationCheck, Remark, names_in_words
+from rigidfleet.preflight.findings import DENSE, FormationCheck, Remark, names_with_verb
 from rigidfleet.rigidity import (
     Kind,
     Rigidity,
@@ -141,9 +141,9 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
     """Remarks on formations that are not rigid, contradict themselves, or share their distances with other shapes."""
     exact = mission.constraint.solver == "exact"
     if skipped := [f.name for f in formations if f.skipped]:
-        yield _note(f"to limit the time of the check, {names_in_words(skipped)} skipped")
+        yield _note(f"to limit the time of the check, {names_with_verb(skipped)} skipped")
     if idle := [f.name for f in formations if f.held_by == "nothing"]:
-        yield _note(f"{names_in_words(idle)} not used in any phase")
+        yield _note(f"{names_with_verb(idle)} not used in any phase")
     yield from _flat_start_remarks(mission)
     soft = {
         f.name
@@ -175,7 +175,7 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
                 yield _note(text)
             continue
         if r.rigidity_class is RigidityClass.FLEXIBLE or f.name in soft:
-            yield from _flexible(f.name, r, forecasts.get(f.name))
+            yield from _flex_remarks(f.name, r, forecasts.get(f.name))
         elif r.rigidity_class is RigidityClass.UNDECIDED and alone:
             yield _note(f"'{f.name}' is undecided: {r.reason}")
         elif r.rigidity_class is RigidityClass.PRESTRESS_STABLE and alone:
@@ -260,7 +260,7 @@ def _flexibility_forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[
     return out
 
 
-def _flexible(name: str, r: Rigidity, forecast: tuple[int, float] | None) -> Iterator[Remark]:
+def _flex_remarks(name: str, r: Rigidity, forecast: tuple[int, float] | None) -> Iterator[Remark]:
     """Remark on a formation that is flexible or in a plane; the forecast is None where slots hold it."""
     who = first_few([agent_names(flex.agents) for flex in r.flexes], 4, "; ")
     text = f"'{name}' is flexible: {r.rank} of {r.needed} independent distances; free: {who}"

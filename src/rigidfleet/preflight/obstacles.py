@@ -13,7 +13,7 @@ from rigidfleet.mission import Box, Ground, Mission, Obstacle
 from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
 from rigidfleet.planning.clearance import CLOSE, clearance_to, speed_bounds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
-from rigidfleet.preflight.findings import SLACK, Preflight, Remark, names_in_words
+from rigidfleet.preflight.findings import SLACK, Preflight, Remark, names_with_verb
 from rigidfleet.solids.records import swept_extent
 from rigidfleet.typing import Floats
 
@@ -81,13 +81,13 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
     if unproved:
         names = [mission.obstacles[b].name for b in sorted(unproved)]
         text = (
-            f"to limit the time of the check, the clearance told of {names_in_words(names)} proved to"
+            f"to limit the time of the check, the clearance told of {names_with_verb(names)} proved to"
             f" {max(unproved.values()):.2g} m only"
         )
         yield Remark("note", "obstacle", text)
     if skipped:
         names = [mission.obstacles[b].name for b in sorted(skipped)]
-        text = f"to limit the time of the check, {names_in_words(names)} skipped"
+        text = f"to limit the time of the check, {names_with_verb(names)} skipped"
         yield Remark("note", "obstacle", text)
     yield from _gap_remarks(mission, preflight, radius)
 
@@ -100,7 +100,7 @@ def boundary_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
     watch, worst = BoundaryWatch(mission), dict[tuple[str, bool], tuple[Worst, str]]()
     for planned in preflight.planned_phases if watch.every else ():
         states = np.stack([planned.position, planned.velocity, planned.acceleration])
-        watch.take_way(Piecewise.hermite(planned.time, states))
+        watch.add_way(Piecewise.hermite(planned.time, states))
         for name, x in watch.search().items():
             at, rank = (name, planned.exact), QUANTITIES[name].rank
             if at not in worst or rank(x.value) > rank(worst[at][0].value):

@@ -271,7 +271,7 @@ def _number_comparison_table(
         values = [measure(*each) for each in zip(flights, verdicts, strict=True)]
         if all(x is None for x in values):
             continue
-        cells = [Cell("–" if x is None else value(x), _change(values[0], x)) for x in values]
+        cells = [Cell("–" if x is None else value(x), _change_text(values[0], x)) for x in values]
         rows.append(Row((f"{name} [{unit}]" if unit else name, *cells)))
     return FactTable(("quantity", *labels), rows)
 
@@ -291,7 +291,7 @@ def _mean_thrust(result: Result) -> float | None:
     return float(np.trapezoid(mean, result.time)) / length
 
 
-def _change(first: float | None, x: float | None) -> str:
+def _change_text(first: float | None, x: float | None) -> str:
     """Change of a number from that of the first flight, if it is meaningful."""
     if first is None or x is None or abs(first) < 1e-6:
         return ""
@@ -333,10 +333,10 @@ def _key_paths_and_values(data: Any, key: str = "") -> Iterator[tuple[str, str]]
 def _figure_for_page(result: Result, name: str) -> dict[str, str]:
     svg = plotting.render_figure(result, name, ["svg"])["svg"]
     pairs = name == "constraint_error" and not len(result.edges)
-    return _picture(name, svg, "Shape error of all pairs." if pairs else plotting.caption(name))
+    return _image_data(name, svg, "Shape error of all pairs." if pairs else plotting.caption(name))
 
 
-def _picture(name: str, svg: bytes, caption: str) -> dict[str, str]:
+def _image_data(name: str, svg: bytes, caption: str) -> dict[str, str]:
     return {"name": name.replace("_", " "), "image": _data_url(svg), "caption": caption}
 
 
@@ -348,6 +348,6 @@ def _data_url(svg: bytes) -> str:
 
 def _overlay_pictures(flights: Sequence[Result], labels: Sequence[str]) -> list[dict[str, str]]:
     return [
-        _picture("paths", overlay.svg_of_paths(flights, labels), "Paths of the formations' centres of mass."),
-        _picture("over time", overlay.svg_of_time_curves(flights, labels), "Worst value of all vehicles at each time."),
+        _image_data("paths", overlay.svg_of_paths(flights, labels), "Paths of the formations' centres of mass."),
+        _image_data("over time", overlay.svg_of_time_curves(flights, labels), "Worst value of all vehicles at a time."),
     ]  # fmt: skip

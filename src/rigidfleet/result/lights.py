@@ -73,7 +73,7 @@ def rgb(colours: tuple[str, ...]) -> Floats:
 
 def angles_facing_formation(result: Result) -> tuple[float, float]:
     """Azimuth and elevation [rad] of a viewer, from the flight, who reads the flattest of the lit formations."""
-    best, seen = np.inf, plane_view(np.zeros((1, 3)))
+    best, seen = np.inf, view_angles(np.zeros((1, 3)))
     for phase in range(len(result.phases)):
         formation, k = result.phases[phase].formation, result.samples(phase).stop - 1
         colours = None if formation is None else result.mission.formation_colours(formation)
@@ -86,11 +86,11 @@ def angles_facing_formation(result: Result) -> tuple[float, float]:
         if (thin := thick / max(wide, 1e-9)) < best:
             q = result.attitude[k]
             turn = dcm_from_quaternion(q).T if np.isfinite(q).all() else np.eye(3)
-            best, seen = thin, plane_view(points, turn @ _FRONT)
+            best, seen = thin, view_angles(points, turn @ _FRONT)
     return seen
 
 
-def plane_view(points: Floats, front: Floats | tuple[float, ...] = _FRONT) -> tuple[float, float]:
+def view_angles(points: Floats, front: Floats | tuple[float, ...] = _FRONT) -> tuple[float, float]:
     """Azimuth and elevation [rad] of a viewer who faces the plane of points (n, 3) [m], on the side of ``front`` (3,).
 
     Of the planes through a line it is the one that faces the front most, without any plane the front itself. A plane

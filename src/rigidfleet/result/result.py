@@ -439,7 +439,7 @@ class Result(Shown):
 
         off = np.full(self.n_agents, np.inf)
         over = self.position[:, :, 2] - self.mission.fleet.radius
-        over = over - self.mission.height_at(*np.moveaxis(self.position, 2, 0))
+        over = over - self.mission.height_below(*np.moveaxis(self.position, 2, 0))
         down = self.left & (over <= PAD)
         for i, phase in enumerate(self.phases):
             rows = self.samples(i)

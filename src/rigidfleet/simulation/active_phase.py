@@ -22,7 +22,7 @@ from rigidfleet.simulation.callbacks import (
     Controller,
     ExternalForce,
     Observation,
-    call_user,
+    call_user_code,
     check_force,
 )
 from rigidfleet.simulation.extremes import Extremes
@@ -79,7 +79,7 @@ class ActivePhase:
         self.pieces, self.pause, self.workspaces = pieces, pause, workspaces
         self.lost = plan.before.lost
         self.parted = plan.links_lost[1] <= plan.start  # (L,) links that are lost
-        self.next_loss = self._next_loss()  # of a vehicle or a link [s]
+        self.next_loss = self._loss_time()  # of a vehicle or a link [s]
         self.control_calls = 0  # number of calls of the user's controller
         self.held: Problem | None = None  # with the controller's force
         # Evaluations, steps and rejections before a loss.
@@ -187,7 +187,7 @@ class ActivePhase:
         """The problem with what a user's controller asks for now: forces, or a command of vehicles."""
         self.drop_command()
         when = f"at t = {self.t:.3f} s"
-        answer = call_user("the controller", when, controller, self.observe())
+        answer = call_user_code("the controller", when, controller, self.observe())
         if isinstance(answer, Command):
             return self.problem_under(answer)
         force = check_force(answer, len(self.lost), "the controller", self.t)
@@ -205,7 +205,7 @@ class ActivePhase:
             self.fly_to(min(t, t_end), controller, rate)
             if self.t < min(t, self.plan.t_end):
                 return  # between two checks
-            quiet = self.t - self.lateness >= least and self._largest_error() <= settle.tolerance
+            quiet = self.t - self.lateness >= least and self._settling_error() <= settle.tolerance
             self.quiet_since = min(self.quiet_since, self.t) if quiet else math.inf
 
     def switch_problem_by_hand(self, problem: Problem) -> None:
@@ -272,7 +272,7 @@ class ActivePhase:
             self.lost = self.lost | now
             plan.before.lost = self.lost
             self.extremes.remove_lost(self.lost)
-        self.next_loss = self._next_loss()
+        self.next_loss = self._loss_time()
         n = len(self.lost)
         self.count_work()
         kept = plan.remove_lost_edges(self.lost, self.parted)
@@ -288,7 +288,7 @@ class ActivePhase:
         self.held = held._replace(graph=plan.problem.graph)
         return self.held
 
-    def _next_loss(self) -> float:
+    def _loss_time(self) -> float:
         """Time [s] at which the next vehicle or link is lost; infinity if none is."""
         if not self.plan.loses:
             return math.inf
@@ -305,7 +305,7 @@ class ActivePhase:
         """Times (K,) [s] to record from now to ``t_end`` [s]."""
         return self.sampler(self.plan, self.t, t_end, first=not self.begun, stop=self.stop)
 
-    def _largest_error(self) -> float:
+    def _settling_error(self) -> float:
         """Largest error [m] of a constraint, a slot or the goal at the integrator's state.
 
         An attitude error counts as the distance by which it moves a slot.

@@ -19,7 +19,7 @@ from rigidfleet.assessment.doubt import DrawnWays, uncertainty_facts, verdict_wi
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign.curves import ASSUMED, Trajectories
 from rigidfleet.math import smoothing
-from rigidfleet.math.piecewise import Piecewise, join_curves
+from rigidfleet.math.piecewise import Piecewise, stack_ways
 from rigidfleet.math.smoothing import NoiseEstimate, PositionNoise, Positions, Smoothed
 from rigidfleet.result import Extremum, Result
 from rigidfleet.setpoints import ways_of
@@ -137,7 +137,7 @@ def _likely_flight(
         beyond = [min(np.quantile(x, 0.95), _STEPS * np.median(x)) for x in steps]
         ends += np.outer(beyond, [-1.0, 1.0])
     each = zip(smoothed, ends.tolist(), strict=True)
-    whole = join_curves([own.way.between(*end) for own, end in each])
+    whole = stack_ways([own.way.between(*end) for own, end in each])
     if not read.away:
         ends[:] = whole.time[[0, -1]]
     if plan is not None:
@@ -148,7 +148,7 @@ def _likely_flight(
         judged |= {"names": read.names, "spans": spans, "since": read.since}
         flown = result_of_curve(whole.stack(blank), WORDS, **judged)
     else:
-        flown = flight_of_plan(plan, planned, whole, spans)
+        flown = replace_ways(plan, planned, whole, spans)
     del whole, planned  # large
     zero = flown.statistics.get("clock", 0.0)
     resets = [t for log, x in zip(logs, read.measured, strict=False) for t in log.time[x.resets]]
@@ -239,7 +239,7 @@ def _deviations_of_draws(flown: Result, models: Sequence[Sequence[Smoothed]], la
     return off
 
 
-def flight_of_plan(plan: Result, planned: Piecewise, way: Piecewise, spans: list[Any]) -> Result:
+def replace_ways(plan: Result, planned: Piecewise, way: Piecewise, spans: list[Any]) -> Result:
     """A result of a plan with ways (K, N, 3, P) in place of what it flew, at the times that both have.
 
     Forces, attitudes and messages are unknown.

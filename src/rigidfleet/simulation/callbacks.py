@@ -88,7 +88,7 @@ Command = AttitudeCommand | RotorCommand
 Controller = Callable[[Observation], "ArrayLike | Command"]
 
 
-def call_user(who: str, when: str, function: Callable[..., Any], *arguments: object) -> Any:
+def call_user_code(who: str, when: str, function: Callable[..., Any], *arguments: object) -> Any:
     """What a user's function returns; its exceptions are told as those of a flight."""
     try:
         return function(*arguments)
@@ -184,7 +184,7 @@ class ExternalForce:
             x = array_at_address(r).copy(), array_at_address(v).copy()
             try:
                 if self.error is None:
-                    answer = call_user("the force", f"at t = {t:.3f} s", force, t, *x)
+                    answer = call_user_code("the force", f"at t = {t:.3f} s", force, t, *x)
                     array_at_address(f)[:] = check_force(answer, n, "the force", t)
                     return
             except BaseException as error:

@@ -23,7 +23,7 @@ from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.solvers import choose_method
 from rigidfleet.planning.timing import complete_times
-from rigidfleet.planning.tolerances import absolute_tolerances, most_steps, tolerance_of_velocity
+from rigidfleet.planning.tolerances import absolute_tolerances, step_limit, tolerance_of_velocity
 from rigidfleet.typing import Bools, Floats, Ints
 
 
@@ -165,7 +165,7 @@ class _Flights:
             (now.t, plan.t_end),
             rtol=options.rtol,
             atol=absolute_tolerances(options, y.shape[1], velocity, plan.distances, large=False),
-            max_steps=most_steps(plan.t_end - now.t),
+            max_steps=step_limit(plan.t_end - now.t),
             vectors=shared,
             threads=threads,
         )

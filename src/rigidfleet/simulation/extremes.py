@@ -148,7 +148,9 @@ class CurveWatch:
 
     def deepest_contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far; None if there was none."""
-        contacts = [x for x in (self._extremum(records.FLYING), self._landing()) if x is not None]
+        contacts = [
+            x for x in (self._extremum(records.FLYING), self._landing_clearance()) if x is not None
+        ]
         deepest = min(contacts, key=lambda x: x.value, default=None)
         return deepest if deepest is not None and deepest.value < -_TOUCH else None
 
@@ -161,7 +163,7 @@ class CurveWatch:
         if self.boundaries.every:
             rows = _trail_rows(state, np.arange(first, steps))
             clock, points = state.trail.clock[rows], state.trail.points[rows]
-            self.boundaries.take_steps(*steps_in_world(clock, points, problem), self.left)
+            self.boundaries.add_steps(*steps_in_world(clock, points, problem), self.left)
         if self.n > _FEW:
             for step in range(first, steps):
                 row = _trail_rows(state, (step,))
@@ -244,13 +246,13 @@ class CurveWatch:
         extremes: dict[str, Extremum | None] = dict(self.touched)
         if self.solids is not None or len(self.boxes):
             extremes |= {name: self._extremum(k) for name, k in _OF_FLIGHT.items()}
-            extremes["clearance_end"] = self._landing()
+            extremes["clearance_end"] = self._landing_clearance()
         for name, x in extremes.items():
             if x is not None:
                 last = [p for p in phases if p.t_start <= x.time] or phases
                 last[-1].extremes[name] = x
 
-    def _landing(self) -> Extremum | None:
+    def _landing_clearance(self) -> Extremum | None:
         """The least clearance of an agent that has stayed near since, as it may be landing; None if there is none."""
         near = self.low[:, 0]
         if math.isfinite(near.min()):
@@ -370,7 +372,7 @@ class Extremes(CurveWatch):
         self.avoidance: avoidance.AvoidanceArrays | None = None  # that of the phase under way
         self.of_layers: dict[str, Extremum] = {}  # what its clock and its body layer did
 
-    def use_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+    def replace_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Continue among these obstacles; the first of them are those before."""
         self._set_obstacles(obstacles)
         if "monitor" in vars(self):
@@ -426,7 +428,7 @@ class Extremes(CurveWatch):
         half = (len(state.trail.clock) - 1) // 2
         return half + 1 - int(state.count[records.TRAILED])
 
-    def hand_over(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
+    def send_steps(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Let another thread evaluate the steps in the trail; no more than `steps_until_trail_full` may follow.
 
         Until `wait_for_steps`, only that thread may use this monitor, ``work``, and what the problem's law changes.
@@ -468,9 +470,9 @@ class Extremes(CurveWatch):
         self.of_vehicles = {}
         rotors, left = ~(vehicles.point | gone), np.flatnonzero(~gone)
         for k, kind, sign in _SAMPLED:
-            self._take_least(kind, sign * state.worst[left, k], state.worst_time[left, k], left)
+            self._update_least(kind, sign * state.worst[left, k], state.worst_time[left, k], left)
         load, when = (x[left, fleet.LOAD] for x in (state.worst, state.worst_time))
-        self._take_least(records.THRUST_MARGIN, vehicles.limit[left] - load, when, left)
+        self._update_least(records.THRUST_MARGIN, vehicles.limit[left] - load, when, left)
         rows: dict[str, tuple[Floats, Floats]] = {}
         if rotors.any():
             peak = np.where(rotors[:, None], state.peak, -1.0)
@@ -516,7 +518,7 @@ class Extremes(CurveWatch):
                 extremes[f"{name}_lost"] = Extremum(value, t, *who)
         return extremes
 
-    def _take_least(self, kind: int, values: Floats, times: Floats, who: Ints) -> None:
+    def _update_least(self, kind: int, values: Floats, times: Floats, who: Ints) -> None:
         """Take the least of the agents' values into account; of equal ones, the first in time."""
         if len(who) and (value := float(values.min())) < self.worst[kind]:
             i = int(np.where(values == value, times, np.inf).argmin())

@@ -380,7 +380,7 @@ class Flight:
         else:
             check_formation(self.mission, phase)
         self._leave_phase(changed=True)
-        if self.mission.on_loss == "continue" or not self._is_current_of_route(phase):
+        if self.mission.on_loss == "continue" or not self._is_route_phase(phase):
             self._state_now.blend = None
         if self._phases_begun:
             self._report_progress(phase, planning=True)
@@ -443,7 +443,7 @@ class Flight:
         if duration is not None and not duration > 0.0:
             raise ValueError(f"the duration must be positive [s], not {duration!r}")
         plan = active.plan
-        active.stop = min(math.inf if duration is None else active.t + duration, self._next_loss())
+        active.stop = min(math.inf if duration is None else active.t + duration, self._loss_time())
         t_end, settle = min(active.stop, plan.t_end), plan.phase.settle
         try:
             if settle is None:
@@ -463,7 +463,7 @@ class Flight:
     def end_phase_if_over(self) -> bool:
         """End the phase under way if it is over; return whether it goes on, as `advance` does."""
         active = self.under_way()
-        plan, settle, loss = active.plan, active.plan.phase.settle, self._next_loss()
+        plan, settle, loss = active.plan, active.plan.phase.settle, self._loss_time()
         self.phases[-1].t_end = active.t
         if active.has_settled or active.is_over:
             settled = active.has_settled
@@ -608,7 +608,7 @@ class Flight:
         if self._active is not None:
             self._active.search_extremes(last=True)
         self.mission = self.mission.model_copy(update={"obstacles": tuple(obstacles)})
-        self._extremes.use_obstacles(obstacles)
+        self._extremes.replace_obstacles(obstacles)
         vehicles = self._vehicles
         if vehicles is not None and vehicles.avoidance is not None:
             solids = join_solids([thing.solid for thing in obstacles])
@@ -646,15 +646,15 @@ class Flight:
             raise FlightError(f"no phase is under way: {why}")
         return self._active
 
-    def _next_loss(self) -> float:
+    def _loss_time(self) -> float:
         """Time [s] of the loss that ends the phase under way; infinity if none does.
 
         Phases begun by hand go on: who began them decides.
         """
-        routed = self._is_current_of_route(self._phases_begun[-1])
+        routed = self._is_route_phase(self._phases_begun[-1])
         return self.mission.abandons_at if routed and not self._reacted else math.inf
 
-    def _is_current_of_route(self, phase: Phase) -> bool:
+    def _is_route_phase(self, phase: Phase) -> bool:
         """Whether the route gives a phase that has begun last, or is about to."""
         return self._following > 0 and phase is self._route[self._following - 1]
 
@@ -694,7 +694,7 @@ class Flight:
         if (
             not active.has_flown
         ):  # as if it had never begun: if it is the mission's, it is still to come
-            self._following -= self._is_current_of_route(self._phases_begun[-1])
+            self._following -= self._is_route_phase(self._phases_begun[-1])
             del self.phases[-1], self._phases_begun[-1], self._plans[-1:]
             return
         if not (active.has_settled or active.is_over or abandoned):

@@ -27,11 +27,11 @@ from rigidfleet.planning.body_layer import (
     rigid_motion_rows,
     scale_bound_rows,
 )
-from rigidfleet.planning.derivatives import body_series, slot_derivatives, slot_series
+from rigidfleet.planning.derivatives import body_taylor, slot_derivatives, slot_taylor
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock, delay_by, time_derivatives
 from rigidfleet.result import Extremum
-from rigidfleet.solids.distance import in_own_axes, outward_normal, signed_distance
+from rigidfleet.solids.distance import local_point, outward_normal, signed_distance
 from rigidfleet.typing import Floats, Ints
 
 #: Time for which a decision holds [s].
@@ -123,11 +123,13 @@ class Leader:
         """Decide at t [s] until ``end`` [s]; returns the problem to fly, or None if it is the one flown already."""
         h = end - t
         acts = self._can_lead(t + h)
-        self.clock.set_aim(*(self._target(t, a) if acts and self.settings.clock else (1.0, np.inf)))
-        accelerations = (
-            self._detour_rates(t, a) if acts and self.settings.body else self.deviation.decay()
+        self.clock.set_aim(
+            *(self._clock_aim(t, a) if acts and self.settings.clock else (1.0, np.inf))
         )
-        if self.clock.runs_in_real_time and self.deviation.is_none and not accelerations.any():
+        accelerations = (
+            self._detour_accels(t, a) if acts and self.settings.body else self.deviation.decay()
+        )
+        if self.clock.runs_in_real_time and self.deviation.is_zero and not accelerations.any():
             self.now = None
             if not self.leads:
                 return None
@@ -135,14 +137,14 @@ class Leader:
             return delay_by(self.problem, self.clock.delay)
         self.leads = True
         self.now = LeaderState(t, copy.copy(self.clock), self.deviation)
-        problem = self._moved_problem(t, h, accelerations)
+        problem = self._detour_problem(t, h, accelerations)
         lost = self.clock.advance(h)
         if lost > 0.0:
             self.waited = t if self.waited is None else self.waited
             self._delay_events(end, lost)
         self.deviation = self.deviation.state_after(h, accelerations, h)
         self.deviation.end_if_small(still=self.calm)
-        if not self.deviation.is_none:
+        if not self.deviation.is_zero:
             self.steering += h
             self.steered = t if self.steered is None else self.steered
         return problem
@@ -177,7 +179,7 @@ class Leader:
         reference = self.problem.reference
         return reference.kind != SQUARED or t - self.clock.delay >= reference.t0 + reference.T_b
 
-    def _target(self, t: float, a: AvoidanceArrays) -> tuple[float, float]:
+    def _clock_aim(self, t: float, a: AvoidanceArrays) -> tuple[float, float]:
         """The rate to aim at, and the bandwidth of the clock.
 
         The greatest one at which the slots keep away from all that moves, as far as it is known, over the horizon; if
@@ -218,7 +220,7 @@ class Leader:
         for o in seen:
             x, bound = a.sight.track[o], a.sight.bound[o]
             away = r - (x[:3] + ahead[:, None] * x[3:])[:, None]
-            room = signed_distance(*in_own_axes(*away.transpose(2, 0, 1), o, a.solids), o, a.solids)
+            room = signed_distance(*local_point(*away.transpose(2, 0, 1), o, a.solids), o, a.solids)
             room = room - (a.reach + a.spare) - (bound[0] + bound[1] / 3.0 * ahead)[:, None]
             if (worst := float(room.min())) < least:
                 least, self.who = worst, int(np.unravel_index(room.argmin(), room.shape)[1])
@@ -242,7 +244,7 @@ class Leader:
         if begun < (blend := plan.reference).t0 + blend.T_b:
             plan.reference = blend._replace(t0=blend.t0 + lost)
 
-    def _moved_problem(self, t: float, h: float, accelerations: Floats) -> Problem:
+    def _detour_problem(self, t: float, h: float, accelerations: Floats) -> Problem:
         """The problem from t for h [s]: the path at the clock's time, moved by the deviation, as polynomials.
 
         They have the values and two derivatives of both at either end, and at the end of the path, where its
@@ -259,21 +261,21 @@ class Leader:
         dt[2:-1:2] += _BESIDE
         progress, s, slope, _ = self.clock.progress_in(dt)
         tau, rates = t - self.clock.delay + progress, np.stack([s, slope])
-        cm, axes = body_series(motion, tau, 3)
+        cm, axes = body_taylor(motion, tau, 3)
         axes = np.broadcast_to(axes, (3, 3, 3, len(tau)))  # also of a body that does not turn
         still = np.zeros_like(axes)
         still[0] = np.eye(3)[..., None]
         p = time_derivatives(
-            series.derivatives(slot_series(reference, (np.zeros_like(cm), still), tau)), rates
+            series.derivatives(slot_taylor(reference, (np.zeros_like(cm), still), tau)), rates
         )
         x = time_derivatives(series.derivatives(cm), rates)
-        B = series.from_derivatives(time_derivatives(series.derivatives(axes), rates))
+        B = series.series_by_derivatives(time_derivatives(series.derivatives(axes), rates))
         ends = [self.deviation.state_after(each, accelerations, h) for each in dt]
         moves, turns, grows = (
             np.stack(each, axis=-1) for each in zip(*(e.taylor_series() for e in ends), strict=True)
         )
         x += series.derivatives(moves)
-        grown = series.product(series.from_derivatives(p), grows[:, None, None])
+        grown = series.product(series.series_by_derivatives(p), grows[:, None, None])
         p = series.derivatives(grown)
         B = series.product(np.moveaxis(turns, -1, 1), np.moveaxis(B, -1, 1), np.matmul)
         phi = series.derivatives(series.rotation_vector_series(B[0, 0].T @ B))
@@ -294,12 +296,12 @@ class Leader:
 
     # -- the body -----------------------------------------------------------------------------------------
 
-    def _detour_rates(self, t: float, a: AvoidanceArrays) -> Floats:
+    def _detour_accels(self, t: float, a: AvoidanceArrays) -> Floats:
         """Second derivatives (7,) of the deviation to take: those of its decay, changed as barriers need."""
         accelerations, self.calm = self.deviation.decay(), True
         sight = a.sight
         moving = np.flatnonzero((sight.moves == 1) & (sight.known == KNOWN))
-        if not len(moving) and self.deviation.is_none:
+        if not len(moving) and self.deviation.is_zero:
             return accelerations
         r, v, rise, arms = self._slot_motion(t)
         z = self.deviation.scale[0]
@@ -309,13 +311,15 @@ class Leader:
         if len(rows):
             accelerations = self.deviation.decay(NEAR)
         short = needed - rows @ accelerations
-        if not (len(short) and short.max() > 0.0) and self.deviation.is_none:
+        if not (len(short) and short.max() > 0.0) and self.deviation.is_zero:
             return accelerations
         self.calm = not (len(short) and short.max() > 0.0)
         if not self.calm:
             self.who = int(who[short.argmax()])
         # Off the planned path, what stands still counts, too
-        barriers = (self._barriers(o, r, v, rise, a) for o in np.flatnonzero(sight.moves == 0))
+        barriers = (
+            self._still_barriers(o, r, v, rise, a) for o in np.flatnonzero(sight.moves == 0)
+        )
         more, least, _ = self._barrier_rows(barriers, arms, limit)
         rows, needed = np.vstack([rows, more]), np.append(needed, least)
         if self._is_any_scaled([self.deviation]) or self._can_scale_slots:
@@ -345,8 +349,8 @@ class Leader:
     def _slot_motion(self, t: float) -> tuple[Floats, Floats, Floats, Floats]:
         """Slots (N, 3), velocities, accelerations without those of the deviation, and arms from the body's origin."""
         tau = np.array([t - self.clock.delay])
-        cm, axes = body_series(self.problem.motion, tau, 3)
-        slots = slot_series(self.problem.reference, (cm, axes), tau)
+        cm, axes = body_taylor(self.problem.motion, tau, 3)
+        slots = slot_taylor(self.problem.reference, (cm, axes), tau)
         rates = np.array(self.clock.rate[:2])[:, None]
         c = time_derivatives(series.derivatives(cm), rates)[..., 0]
         arm = (
@@ -402,12 +406,12 @@ class Leader:
         nears = (along < 0.0) & (-along < _HORIZON * speed**2)
         return normal / length[:, None], np.where(nears, needed, -np.inf)
 
-    def _barriers(
+    def _still_barriers(
         self, o: int, r: Floats, v: Floats, rise: Floats, a: AvoidanceArrays
     ) -> tuple[Floats, Floats]:
         """Barriers of slots against obstacle o, which stands still; see `_moving_obstacle_barriers`."""
         solids = a.solids
-        at = in_own_axes(*r.T, o, solids)
+        at = local_point(*r.T, o, solids)
         away = signed_distance(*at, o, solids)
         normal = np.stack(np.broadcast_arrays(*outward_normal(*at, o, solids)), axis=1)
         if solids.turned[o]:

@@ -15,7 +15,7 @@ from rigidfleet.errors import FlightError
 from rigidfleet.kernel.fleet import ANSWERED, TICKS, SampledFlight, SampledState
 from rigidfleet.kernel.mail import NONE
 from rigidfleet.kernel.problem import TRACKING, Problem, Workspace
-from rigidfleet.simulation.callbacks import call_user, copy_finite_array
+from rigidfleet.simulation.callbacks import call_user_code, copy_finite_array
 from rigidfleet.typing import Floats
 
 
@@ -113,7 +113,7 @@ class OwnLaws:
         for i, view in enumerate(self.views(phase, problem, w, flight, state)):
             if view is None:
                 continue
-            answer = call_user(f"the law of agent {i + 1}", where, self.laws[i], view)
+            answer = call_user_code(f"the law of agent {i + 1}", where, self.laws[i], view)
             try:
                 state.f_u[i], said[i], numbers = _parse_law_answer(answer)
             except ValueError as unfit:

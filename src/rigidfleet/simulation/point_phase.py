@@ -12,7 +12,7 @@ from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import Problem
-from rigidfleet.planning.tolerances import most_steps
+from rigidfleet.planning.tolerances import step_limit
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import Command, article_and_kind
 from rigidfleet.simulation.diagnosis import diagnose
@@ -108,7 +108,7 @@ class PointPhase(ActivePhase):
         if last or not self.aside:
             self.extremes.monitor_steps(self.flown, work, self.state, last=last)
         else:
-            self.extremes.hand_over(self.flown, work, self.state)
+            self.extremes.send_steps(self.flown, work, self.state)
 
     def prepare_stretch(self, problem: Problem, times: Floats) -> Stretch:
         """Prepare to integrate a problem from now on, and to record the states at some times (K,) [s]."""
@@ -138,7 +138,7 @@ class PointPhase(ActivePhase):
         """Whether the phase takes far more steps than its duration explains."""
         state, since = self.state, self.t - self.plan.start
         steps = int(state.count[records.ACCEPTED] + state.count[records.REJECTED])
-        return steps > most_steps(since)
+        return steps > step_limit(since)
 
     def problem_under(self, command: Command) -> Problem:
         """Point masses take no command of vehicles."""

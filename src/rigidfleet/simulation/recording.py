@@ -234,12 +234,12 @@ def assemble_result(
         ending=ending,
         statistics=statistics,
         later=later,
-        **({} if flown is None or network is None else _messages(mission, flown.age, *network)),
+        **({} if flown is None or network is None else _message_data(mission, flown.age, *network)),
         **(_UNMADE | now),
     )
 
 
-def _messages(mission: Mission, age: Floats, net: Links, mail: Mail) -> dict[str, Any]:
+def _message_data(mission: Mission, age: Floats, net: Links, mail: Mail) -> dict[str, Any]:
     """Ages of messages at samples, and of what was sent, heard, lost and used, of each edge both ways."""
     n, pairs = mission.n_agents, np.stack([mission.edges, mission.edges[:, ::-1]], axis=1)
     of = np.searchsorted(net.links @ [n, 1], pairs @ [n, 1])  # (E, 2)

@@ -26,8 +26,8 @@ from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.vehicles import (
     TickTables,
     YawTurn,
+    gilbert_transitions,
     initial_yaw,
-    loss_transitions,
     sampled_flight,
     yaw_turn_from,
 )
@@ -94,7 +94,7 @@ class FleetState:
 
     def lose_messages(self, loss: float) -> None:
         """Let links lose a share of the messages from now on."""
-        worsens, recovers = loss_transitions(loss, self.burst)
+        worsens, recovers = gilbert_transitions(loss, self.burst)
         network = self.flight.network._replace(worsens=worsens, recovers=recovers)
         self.flight = self.flight._replace(network=network)
 
@@ -381,7 +381,7 @@ class SampledPhase(ActivePhase):
             return
         before, tau = None, self.sampled.tau if self.flight.clocks.own else None
         if planned is not self.tabled and source.compensated:
-            before = source.start_path(planned, tick, tables, tau)
+            before = source.switch_path(planned, tick, tables, tau)
         # A piece of a reference that is led holds until the next stop
         until = self.plan.t_end
         if self.by_pieces:

@@ -34,7 +34,7 @@ def workspace_and_solver(
     order = None
     if plan.method == "elimination":
         steps = solvers.elimination_steps(len(points), edges)
-        order = None if steps is None else ordering.prepare_order(steps, plan.problem.graph.edges)
+        order = None if steps is None else ordering.pivot_order(steps, plan.problem.graph.edges)
     axes = plan.problem.has_frame or plan.problem.law.k_def > 0.0
     dissect = partial(solvers.dissection_order, points, edges)
     solver = large_solver(plan.problem, Setup(order, dissect, *plan.residual_tolerances(), axes))

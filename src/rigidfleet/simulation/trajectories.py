@@ -27,10 +27,10 @@ from rigidfleet.math.piecewise import (
     SAME,
     Piecewise,
     common_knots,
-    join_curves,
     pad,
     piece_index,
     refine_knots,
+    stack_ways,
 )
 from rigidfleet.mission import Mission, as_mission
 from rigidfleet.result import Extremum, PhaseRecord, Result, presence
@@ -335,7 +335,7 @@ def result_of_trajectories(read: Trajectories, **judged: Any) -> Result:
     ends = knots[np.searchsorted(knots, [curve.time[[0, -1]] - 2.0 * SAME for curve in curves])]
     spans = ends.tolist() if read.away and np.ptp(ends, axis=0).any() else ()
     result = result_of_curve(
-        join_curves(curves), read.assumed, names=read.names, spans=spans, since=read.since, **judged
+        stack_ways(curves), read.assumed, names=read.names, spans=spans, since=read.since, **judged
     )
     result.statistics |= {"notes": list(read.notes), "read": list(read.read)}
     return result
@@ -401,7 +401,7 @@ def _sample_curve(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats
     for row in range(0, len(k), together):
         rows = slice(row, row + together)
         after = np.diff(time)[k[rows]] * share[rows]
-        x = series.derivatives(series.of_polynomials(curve.pieces[k[rows]], after, 4))
+        x = series.derivatives(series.polynomial_series(curve.pieces[k[rows]], after, 4))
         state[:, rows], yaw[:, rows] = x[..., :3], x[:2, ..., 3]
     yaw[1, share == 0.0] -= turn[k[share == 0.0]]
     yaw[1, share == 1.0] += turn[k[share == 1.0] + 1]
@@ -427,7 +427,7 @@ def watch_curve(
         _watch_positions(watch, way, grid, spans)
         here = presence(0.5 * (way.time[1:] + way.time[:-1]), spans, way.pieces.shape[1])
         way = Piecewise(way.time, way.pieces * here[..., None, None])
-        _take_accelerations(fastest, way, directed=watch.directed)
+        _update_peak_accels(fastest, way, directed=watch.directed)
     return fastest
 
 
@@ -470,7 +470,7 @@ def _count_parts(way: Piecewise) -> Ints:
     return np.ceil((size @ np.array(weight) / _CLOSE) ** 0.2).clip(1, _PARTS).astype(np.int64)
 
 
-def _take_accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: bool) -> None:
+def _update_peak_accels(best: dict[str, Extremum], curve: Piecewise, *, directed: bool) -> None:
     """Take the greatest accelerations of some pieces into account, by direction too; straight lines have none."""
     n = curve.pieces.shape[1]
     if curve.pieces.shape[-1] < 3:

@@ -155,7 +155,7 @@ def vector_from_triangle(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
 # -- surfaces of triangles -----------------------------------------------------------------------------
 
 
-def vector_from_surface(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+def vector_from_solid_surface(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     """Vector from the nearest point of the surface of solid b, of triangles, to the point, and its squared length."""
     first, last = s.first[b], s.last[b]
     t = s.triangles[first[1]]
@@ -222,7 +222,7 @@ def signed_distance(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Numbe
         return near
     if kind == CYLINDER:
         return cylinder_distance(x, y, z, s.size[b])
-    _, _, _, squared = vector_from_surface(x, y, z, b, s)
+    _, _, _, squared = vector_from_solid_surface(x, y, z, b, s)
     away = np.sqrt(squared)
     return where(is_inside(x, y, z, b, s), -away, away)
 
@@ -234,7 +234,7 @@ def outward_normal(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
         return box_normal(x, y, z, s.size[b])
     if kind == CYLINDER:
         return cylinder_normal(x, y, z, s.size[b])
-    i, j, k, squared = vector_from_surface(x, y, z, b, s)
+    i, j, k, squared = vector_from_solid_surface(x, y, z, b, s)
     away = np.sqrt(squared)
     away = where(is_inside(x, y, z, b, s), -away, away)
     known = squared > 0.0
@@ -256,12 +256,12 @@ def solid_displacement(t: Numbers, b: int, s: Any) -> Any:
     return x, y, z
 
 
-def is_present(t: Numbers, b: int, s: Any) -> Any:
+def is_solid_present(t: Numbers, b: int, s: Any) -> Any:
     """Whether solid b is there at time t [s]: some appear, and vanish."""
     return (t >= s.there[b, 0]) & (t <= s.there[b, 1])
 
 
-def in_own_axes(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+def local_point(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     """Coordinates in the axes of solid b, without its motion, of a point in the world."""
     if s.turned[b] == 0:
         return x, y, z
@@ -279,13 +279,13 @@ def in_own_axes(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
 _LOWERED, STEEP = 1e-3, 0.5
 
 
-def is_below(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+def is_solid_below(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     """Whether the nearest part of solid b is below a point of the world, so that a vehicle may stand on it.
 
     Nobody stands on what moves.
     """
-    u, v, w = in_own_axes(x, y, z, b, s)
-    i, j, k = in_own_axes(x, y, z - _LOWERED, b, s)
+    u, v, w = local_point(x, y, z, b, s)
+    i, j, k = local_point(x, y, z - _LOWERED, b, s)
     still = s.last[b, 3] == s.first[b, 3]
     nearer = signed_distance(u, v, w, b, s) - signed_distance(i, j, k, b, s)
     return (nearer >= STEEP * _LOWERED) & still
@@ -330,7 +330,7 @@ def height_below(x: Numbers, y: Numbers, z: Numbers, s: Any) -> Numbers:
 #: The functions that the kernel compiles, each after those that it calls.
 ELEMENTWISE = (
     choose, box_distance, box_normal, cylinder_distance, cylinder_normal,
-    vector_from_segment, edge_side, facet_normal, vector_from_triangle, height_map_point, vector_from_surface,
-    is_inside, signed_distance, outward_normal, solid_displacement, is_present, in_own_axes, is_below, height_range,
-    height_below,
+    vector_from_segment, edge_side, facet_normal, vector_from_triangle, height_map_point, vector_from_solid_surface,
+    is_inside, signed_distance, outward_normal, solid_displacement, is_solid_present, local_point, is_solid_below,
+    height_range, height_below,
 )  # fmt: skip

@@ -59,10 +59,10 @@ class Region(NamedTuple):
             rows = slice(k, k + some)
             across[rows], bound[rows] = self._depth(points[rows, :2], c[rows, :2], outside=outside)
         z, least, greatest = c[:, 2], points[:, 2].min(axis=1), points[:, 2].max(axis=1)
-        now = corner_distance(across if outside else -across, np.maximum(low - z, z - high))
+        now = prism_distance(across if outside else -across, np.maximum(low - z, z - high))
         if outside:
-            return now, corner_distance(bound, np.maximum(low - least, greatest - high))
-        return -now, -corner_distance(-bound, np.maximum(low - greatest, least - high))
+            return now, prism_distance(bound, np.maximum(low - least, greatest - high))
+        return -now, -prism_distance(-bound, np.maximum(low - greatest, least - high))
 
     def _depth(self, points: Floats, c: Floats, *, outside: bool) -> tuple[Floats, Floats]:
         """`depths_of_curves` as seen from above, of control points (M, 2, P) with middles (M, 2)."""
@@ -102,7 +102,7 @@ class Region(NamedTuple):
         return (((a[:, 1] > y) != (b[:, 1] > y)) & right).sum(axis=1) % 2 == 1
 
 
-def corner_distance(across: Floats, above: Floats) -> Floats:
+def prism_distance(across: Floats, above: Floats) -> Floats:
     """Signed distance from what is within two distances at right angles."""
     outside = np.hypot(np.maximum(across, 0.0), np.maximum(above, 0.0))
     return outside + np.minimum(np.maximum(across, above), 0.0)

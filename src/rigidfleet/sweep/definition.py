@@ -326,7 +326,7 @@ class Sweep:
         document, values = (mission or self.mission).to_dict(), values or self.values(run)
         if self.drill:
             stream = faults.random_stream(self.seed, run, 2)
-            faults.apply_fault(document, *values[:2], stream, self.mission.n_agents, self._end)
+            faults.apply_fault(document, *values[:2], stream, self.mission.n_agents, self._end_time)
         for column, value in zip(self.columns, values, strict=True) if not self.drill else ():
             apply_value(document, self.whole, column, value)
         if self.header.random_numbers == "own":
@@ -358,16 +358,16 @@ class Sweep:
 
         Then they are searched once for all runs. The start is such a key, too.
         """
-        from rigidfleet.planning.timing import expand_mission, matters_to_plan
+        from rigidfleet.planning.timing import can_affect_plan, expand_mission
 
-        if any(matters_to_plan(self.mission, column.keys) for column in self.columns):
+        if any(can_affect_plan(self.mission, column.keys) for column in self.columns):
             return self.mission
         with suppress(MissionError):  # without a way, each run says so
             return expand_mission(self.mission)
         return self.mission
 
     @cached_property
-    def _end(self) -> float:
+    def _end_time(self) -> float:
         """Time [s] at which the mission is expected to end."""
         from rigidfleet.planning.legs import phase_spans
         from rigidfleet.planning.timing import complete_times
@@ -412,7 +412,7 @@ def apply_value(
     integral = all(isinstance(x, int) for x in there)
 
     def new_number(there: Any) -> Any:
-        new = column.variation.apply_change(there, value)
+        new = column.variation.changed_value(there, value)
         return round(new) if integral and math.isfinite(new) else new
 
     def new_value(there: Any) -> Any:
@@ -475,7 +475,7 @@ class _Check:
             problem = "has no effect: without [network], one law knows all states"
             self.add(("drill", "links"), problem, "remove it, or add [network] to the mission")
         n = 1 if self.mission is None else self.mission.n_agents
-        for name, most in faults.fault_sizes(n).items():
+        for name, most in faults.max_fault_sizes(n).items():
             if name in drill.model_fields_set and max(getattr(drill, name), default=0) > most:
                 self.add(("drill", name), f"is too much for {n} vehicles", f"give at most {most}")
         grids = drill.case_grids(n)

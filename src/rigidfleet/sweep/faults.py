@@ -22,7 +22,7 @@ from rigidfleet._common.quantities import MOTIONS
 from rigidfleet._common.text import first_few
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.math import proximity
-from rigidfleet.math.piecewise import Piecewise, common_knots, join_curves, pad, piece_index
+from rigidfleet.math.piecewise import Piecewise, common_knots, pad, piece_index, stack_ways
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.obstacles import Ground
 from rigidfleet.mission.values import AgentNumber, Angle, Part, Positive, key
@@ -67,7 +67,7 @@ class Drill(Part):
     def case_grids(self, n: int) -> list[Variation]:
         """The cases of a show of n vehicles as three grids that go together: a drill is a sweep over them."""
         possible = PARTIAL | SETUP if self.files else UNITS
-        faults, most = self.model_fields_set & UNITS.keys() or possible.keys(), fault_sizes(n)
+        faults, most = self.model_fields_set & UNITS.keys() or possible.keys(), max_fault_sizes(n)
         some = sorted({min(count, n) for count in self.vehicles})
         counts = dict.fromkeys(PARTIAL, some) | dict.fromkeys(SETUP, sorted({1, n}))
         places = range(1, len(self.stale) + 1)
@@ -100,7 +100,7 @@ class Drill(Part):
         return self.model_copy(update={key: x for key, x in named.items() if x})
 
 
-def fault_sizes(n: int) -> dict[str, int]:
+def max_fault_sizes(n: int) -> dict[str, int]:
     """Of how many vehicles or links at most a key may be in a show of n vehicles."""
     return {"vehicles": n, "another": n - 1, "lost": n - 1, "links": n * (n - 1) // 2}
 
@@ -205,7 +205,7 @@ class Show:
 
         self.mission, self.drill, self.n = mission, drill, mission.n_agents
         self.names: tuple[str, ...] = ()
-        self.curve, self.how, verdict, self.names = self._ways(mission, drill.files)
+        self.curve, self.how, verdict, self.names = self._fly_or_read_ways(mission, drill.files)
         if not verdict.passed:
             why = next(check.message for check in verdict.checks if not check.passed)
             raise RigidfleetError(
@@ -224,13 +224,13 @@ class Show:
         self._chords = _Chords.of(self.curve)
         #: The ways of earlier versions.
         self.versions = [
-            self._ways(load_mission(name), ())[0]
+            self._fly_or_read_ways(load_mission(name), ())[0]
             if name in mission_names() or name.endswith(".toml")
-            else self._ways(mission, (name,))[0]
+            else self._fly_or_read_ways(mission, (name,))[0]
             for name in drill.stale
         ]
 
-    def _ways(
+    def _fly_or_read_ways(
         self, mission: Mission, files: Sequence[str]
     ) -> tuple[Piecewise, str, Verdict, tuple[str, ...]]:
         """Ways of a mission's vehicles, or of those in files; what they are, in words; the verdict; names in files.
@@ -258,7 +258,7 @@ class Show:
                 order = [read.names.index(name) for name in self.names]
                 read = read._replace(names=self.names, curves=tuple(read.curves[i] for i in order))
             verdict = assess(result_of_trajectories(read, mission=mission))
-            return join_curves(read.curves), read.assumed, verdict, read.names
+            return stack_ways(read.curves), read.assumed, verdict, read.names
         if mission.n_agents != self.n:
             raise RigidfleetError(
                 f"drill.stale: {mission.name} has {mission.n_agents} agents, and the show {self.n}. Give an earlier"

@@ -111,7 +111,7 @@ def success_figure(table: Table) -> Figure | None:
     if not len(table.run):
         return None
     reasons = failure_counts(table.reason)
-    fig = _titled_figure(table, "Outcome", st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6))
+    fig = _empty_titled_figure(table, "Outcome", st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6))
     left, right = fig.subplots(1, 2, width_ratios=(3, 2))
     n = np.unique(np.geomspace(1, len(table.run), 200).astype(int))
     passed = np.cumsum(table.passed)[n - 1]
@@ -147,7 +147,7 @@ def failure_share_figure(table: Table) -> Figure | None:
     if not cases:
         return None
     names = list(dict.fromkeys(case.fault for case in cases))
-    fig, axes = _small_axes(table, "What the flight bears", names)
+    fig, axes = _axes_for_metrics(table, "What the flight bears", names)
     for name, ax in zip(names, axes, strict=True):
         own = [case for case in cases if case.fault == name]
         failed = np.array([100.0 * case.failed.rate for case in own])
@@ -176,7 +176,7 @@ def worst_runs(table: Table) -> Figure | None:
     }
     if not worst:
         return None
-    fig, axes = _small_axes(
+    fig, axes = _axes_for_metrics(
         table, "The worst of each fault from above [m]: ways into it", list(worst), 2.4
     )
     for case, ax in zip(worst.values(), axes, strict=True):
@@ -217,7 +217,7 @@ def histograms(table: Table) -> Figure | None:
     names = [name for name in outcomes(table) if name != "success"]
     if not names:
         return None
-    fig, axes = _small_axes(table, "Metrics of all runs", names)
+    fig, axes = _axes_for_metrics(table, "Metrics of all runs", names)
     limits, shown = _metric_limits(table), False
     for name, ax in zip(names, axes, strict=True):
         x = table.metrics[name]
@@ -255,7 +255,7 @@ def envelopes(table: Table) -> Figure | None:
             strongest.setdefault(d.outcome, d.varied)
     if not strongest:
         return None
-    fig, axes = _small_axes(table, "Metrics over what drives them most", list(strongest))
+    fig, axes = _axes_for_metrics(table, "Metrics over what drives them most", list(strongest))
     numbers = varied_numbers(table)
     for (name, over), ax in zip(strongest.items(), axes, strict=True):
         x, y = numbers[over], table.metrics[name]
@@ -269,7 +269,7 @@ def envelopes(table: Table) -> Figure | None:
         ax.set_yscale(scale)
         if _scale_of_variation(table, over) == "log":
             ax.set_xscale("log")
-            _log_ticks(ax.xaxis, x)
+            _set_log_ticks(ax.xaxis, x)
         ax.margins(x=0.02)
         ax.set_title(_metric_label(name), loc="left", fontsize=8.5)
         ax.set_xlabel(_axis_label(table, over).replace(", ", ",\n"), fontsize=7.5)
@@ -290,7 +290,7 @@ def correlations(table: Table) -> Figure | None:
         if d.varied in rows:
             values[rows.index(d.varied), columns.index(d.outcome)] = d.correlation
     title = "What drives success and the metrics"
-    fig = _titled_figure(table, title, st.WIDTH, 2.2 + 0.27 * len(rows))
+    fig = _empty_titled_figure(table, title, st.WIDTH, 2.2 + 0.27 * len(rows))
     ax = fig.subplots()
     image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1, aspect="auto")
     names = [c.replace("_", " ") for c in columns]
@@ -356,7 +356,7 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
         if len(inside):
             cells[i, j] = inside.mean() if metric == "success" else np.median(inside)
     title = "Success rate" if metric == "success" else f"Median: {metric.replace('_', ' ')}"
-    fig = _titled_figure(table, title, 0.75 * st.WIDTH, 0.58 * st.WIDTH)
+    fig = _empty_titled_figure(table, title, 0.75 * st.WIDTH, 0.58 * st.WIDTH)
     ax = fig.subplots()
     wide = metric != "success" and _axis_scale(cells[np.isfinite(cells)]) == "log"
     look: dict[str, Any] = {"vmin": 0, "vmax": 100} if metric == "success" else {}
@@ -373,14 +373,14 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
             axis.set_ticks(range(0, len(distinct), every), [f"{v:.3g}" for v in distinct[::every]])
         elif _scale_of_variation(table, name) == "log":
             ax.set(**{key: "log"})
-            _log_ticks(axis, distinct)
+            _set_log_ticks(axis, distinct)
     return fig
 
 
 # -- parts -------------------------------------------------------------------------------------------
 
 
-def _titled_figure(table: Table, title: str, wide: float, high: float) -> Figure:
+def _empty_titled_figure(table: Table, title: str, wide: float, high: float) -> Figure:
     """A figure of a size [in], with its title and what the sweep is."""
     fig = st.blank_figure(wide, high, "constrained")
     of = "" if table.complete else f" of {table.sweep.runs}"
@@ -389,13 +389,13 @@ def _titled_figure(table: Table, title: str, wide: float, high: float) -> Figure
     return fig
 
 
-def _small_axes(
+def _axes_for_metrics(
     table: Table, title: str, names: Sequence[str], high: float = 1.75
 ) -> tuple[Figure, list[Axes]]:
     """Figure with small axes, one for each metric, in rows of a height [in]."""
     columns = min(_COLUMNS, max(2, len(names)))
     rows = -(-len(names) // columns)
-    fig = _titled_figure(table, title, st.WIDTH, 0.9 + high * rows)
+    fig = _empty_titled_figure(table, title, st.WIDTH, 0.9 + high * rows)
     axes = fig.subplots(rows, columns, squeeze=False).ravel().tolist()
     for ax in axes[len(names) :]:
         ax.set_visible(False)
@@ -452,7 +452,7 @@ def _scale_of_variation(table: Table, name: str) -> str:
     return "log" if isinstance(column.variation, LogUniform | Geomspace) else "linear"
 
 
-def _log_ticks(axis: Axis, x: Floats) -> None:
+def _set_log_ticks(axis: Axis, x: Floats) -> None:
     """Plain tick labels for a logarithmic axis that may span less than a decade."""
     if x.max() > _LOGARITHMIC * x.min():
         return

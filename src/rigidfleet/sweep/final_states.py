@@ -47,11 +47,11 @@ def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     begun = perf_counter()
     values = [sweep.values(run) for run in runs]
     r, v = start_states(sweep, values)
-    refused = _refusals(sweep, runs, r, v)
+    refused = _invalid_runs(sweep, runs, r, v)
     out = list(refused)
     r[out], v[out] = sweep.mission.agents.position, sweep.mission.agents.velocity
     ensemble = establish(sweep.mission, r, v)
-    wrong, metrics = _evaluate(sweep.mission, ensemble)
+    wrong, metrics = _judge_states(sweep.mission, ensemble)
     failed = {"complete": ~ensemble.finished} | {k: ensemble.finished & x for k, x in wrong.items()}
     wall = (perf_counter() - begun) / len(runs)
     rows = []
@@ -73,16 +73,16 @@ def start_states(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats,
     agents, count = sweep.mission.agents, len(values)
     own = {"position": agents.position, "velocity": agents.velocity}
     states = {name: np.tile(np.array(x, dtype=float), (count, 1, 1)) for name, x in own.items()}
-    with np.errstate(over="ignore", invalid="ignore"):  # `_refusals` has them
+    with np.errstate(over="ignore", invalid="ignore"):  # `_invalid_runs` has them
         for column, drawn in zip(sweep.columns, np.array(values, dtype=float).T, strict=True):
             _, name, *inner = column.keys
             place = states[str(name)][(slice(None), *map(int, inner))]
             by = drawn.reshape(-1, *(1,) * (place.ndim - 1))
-            place[:] = column.variation.apply_change(place, by)
+            place[:] = column.variation.changed_value(place, by)
     return states["position"], states["velocity"]
 
 
-def _refusals(
+def _invalid_runs(
     sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats
 ) -> dict[int, tuple[str, str]]:
     """Reason and detail of runs with an invalid mission, by index. Only doubtful missions are checked in full."""
@@ -98,7 +98,7 @@ def _refusals(
     return refusals
 
 
-def _evaluate(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict[str, Floats]]:
+def _judge_states(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict[str, Floats]]:
     """Failed checks (B,) and metrics (B,), by name."""
     count = len(flown.finished)
     wrong = {name: np.zeros(count, dtype=bool) for name in ("distances", "shape", "handedness")}

@@ -51,7 +51,7 @@ def expand_path(whole: Mapping[str, Any], path: str) -> list[Keys]:
         remedy = "write agents.mass.2, or agents.position.*.3 for every agent"
         raise NotationError("is not a valid path", remedy)
     steps = [quoted or index or word for quoted, index, word in _STEP.findall(path)]
-    places, depth = _matches(whole, steps)
+    places, depth = _best_matches(whole, steps)
     if depth < len(steps):
         problem = f"there is no '{steps[depth]}' in {'.'.join(steps[:depth]) or 'the mission'}"
         raise NotationError(problem, _path_remedy(whole, places[0][1], steps, depth))
@@ -136,7 +136,7 @@ def _with_defaults(value: Any, n: int, field: FieldInfo | None = None) -> Any:
     return [_with_defaults(v, n) for v in value] if isinstance(value, tuple | list) else value
 
 
-def _matches(whole: Mapping[str, Any], steps: list[str]) -> tuple[list[tuple[Keys, Any]], int]:
+def _best_matches(whole: Mapping[str, Any], steps: list[str]) -> tuple[list[tuple[Keys, Any]], int]:
     """Places, with what is there, that match as many of the first steps as any place does, and how many these are."""
     places: list[tuple[Keys, Any]] = [((), whole)]
     for depth, step in enumerate(steps):
@@ -161,7 +161,7 @@ def _children(at: Any, step: str) -> Iterator[tuple[str | int, Any]]:
 def _path_remedy(whole: Mapping[str, Any], at: Any, steps: list[str], depth: int) -> str:
     """Suggest a similar path that exists, or list what exists at this depth."""
     for guess in _guess_paths(whole, at, steps, depth):
-        places, reached = _matches(whole, guess)
+        places, reached = _best_matches(whole, guess)
         if reached == len(guess) and not any(isinstance(x, dict) for _, x in places):
             words = (word if word == ANY else toml_key(word) for word in guess)
             return f"did you mean '{'.'.join(words)}'?"

@@ -38,13 +38,13 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     groups: dict[int, list[int]] = {}
     for run in runs:
         if sweep.drill and sweep.values(run)[0] not in faults.FLOWN:
-            rows.append(_record_fault(sweep, run))
+            rows.append(_judge_fault(sweep, run))
         else:
             groups.setdefault(run // GROUP, []).append(run)
     return rows + [row for group in groups.values() for row in _fly_group(sweep, group)]
 
 
-def _record_fault(sweep: Sweep, run: int) -> RunRecord:
+def _judge_fault(sweep: Sweep, run: int) -> RunRecord:
     """Judge a geometric fault of a drill."""
     show, fault = _show_and_fault(sweep, run)
     begun = perf_counter()

@@ -54,7 +54,7 @@ class Variation(Part):
         """Values that are taken in turn; none of a distribution."""
         return ()
 
-    def apply_change(self, there: Any, value: Any) -> Any:
+    def changed_value(self, there: Any, value: Any) -> Any:
         """What is in the place of a number, or of an array, for a value of the variation."""
         return _CHANGES[self.change](there, value)
 
@@ -244,7 +244,7 @@ def parse_variation(line: str) -> dict[str, Any]:
     if kind not in KINDS:
         remedy = suggest(kind, KINDS) or f"use one of {', '.join(KINDS)}"
         raise NotationError(f"there is no distribution or grid '{kind}'", remedy)
-    values = [_parse_word(word) for word in _split_words(inside)]
+    values = [_parse_value(word) for word in _split_at_commas(inside)]
     keys = [name for name in KINDS[kind].model_fields if name not in _SHARED]
     if keys == ["values"]:
         return data | {"values": values}
@@ -266,7 +266,7 @@ def _is_usable_value(value: object) -> bool:
     return isinstance(value, str) or (isinstance(value, int | float) and abs(value) <= _MOST)
 
 
-def _split_words(text: str) -> list[str]:
+def _split_at_commas(text: str) -> list[str]:
     """Split text at commas outside of brackets."""
     words, depth = [""], 0
     for letter in text:
@@ -278,7 +278,7 @@ def _split_words(text: str) -> list[str]:
     return [word.strip() for word in words] if text.strip() else []
 
 
-def _parse_word(word: str) -> Any:
+def _parse_value(word: str) -> Any:
     """Convert a word to a number, true, false or a list; otherwise return it without quotes."""
     for read in (json.loads, float):
         try:

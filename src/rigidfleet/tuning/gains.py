@@ -135,7 +135,7 @@ class Screen:
         for name, m in self._margins_of_parts(gains):
             if not m.stable:
                 return -1.0
-            least = min(least, _least_ratio(m, self.own[name]) - self.share * (1 - _ROUNDING))
+            least = min(least, _margin_ratio(m, self.own[name]) - self.share * (1 - _ROUNDING))
             if least < 0:
                 break
         return min(least, 1.0)
@@ -166,7 +166,7 @@ def _distinct_loop_parts(laws: Sequence[tuple[str, ClosedLoops]]) -> list[_Part]
     return sorted(parts.values(), key=lambda part: part.loop.S.size)  # the quick ones first
 
 
-def _least_ratio(now: Margins, was: Margins) -> float:
+def _margin_ratio(now: Margins, was: Margins) -> float:
     """The least ratio of margins to those that were, at most 1; 1 if that was unstable."""
     if not was.stable:
         return 1.0

@@ -340,13 +340,13 @@ def _reduce_lanes(_context, x, largest):
     return types.float64(x, types.boolean), generate
 
 
-def total_or_worst(x, states):
+def lane_sum_or_worst(x, states):
     """Sum over the lanes of x if ``states`` belong to one flight; otherwise the value of the worst flight."""
     raise NotImplementedError("compiled code only")
 
 
-@overload(total_or_worst)
-def _overload_total_or_worst(x, states):
+@overload(lane_sum_or_worst)
+def _overload_lane_sum_or_worst(x, states):
     if states.dtype == lanes:
         return lambda x, states: _reduce_lanes(x, True)
     return lambda x, states: _reduce_lanes(x, False)

@@ -38,14 +38,14 @@ from rigidfleet.solids.records import Solids
 #: Functions that every evaluation calls, to be inlined; calls would take a tenth of a small formation's time.
 _HOT = (
     "closed_loop", "input_law", "constraint_force", "mean_axes", "centre_of_mass", "inertia",
-    "inertia_inverse", "multiply", "damp_deformation", "reference_motion", "desired_agents", "local_law", "septic",
-    "blend_slots", "distance_references", "right_side", "solve_multipliers", "assemble", "cholesky",
+    "inertia_inverse", "multiply", "damp_deformation", "reference_motion", "desired_positions", "local_law", "septic",
+    "blend_slots", "distance_references", "constraint_rhs", "solve_multipliers", "assemble", "cholesky",
     "cholesky_solve", "apply_multipliers",
 )  # fmt: skip
 #: The same of sampled flights.
 _HOT_SAMPLED = ("attitude_matrix", "quaternion_rate", "thrust_of", "speed_of")
 #: Functions of the solver of large formations that return a number.
-_RETURNING = {"solve", "count_blocks", "factor", "inner", "conjugate_gradients"}
+_RETURNING = {"solve", "count_factor_blocks", "factor", "inner", "conjugate_gradients"}
 #: Passes that simplify each translated function before inlining.
 _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
@@ -70,7 +70,7 @@ def flight_object_code(second: "subprocess.Popen[bytes] | None" = None) -> list[
     integration = _ir_text(integrate_segment, Problem, Workspace, *integrated, result=types.int64)
     recording = _ir_text(record_segment, Problem, Workspace, *recorded, result=types.int64)
     codes = [_object_code(*integration, "integrate"), _object_code(*recording, "record")]
-    made = None if second is None else objects.split_objects(second.communicate()[0])
+    made = None if second is None else objects.split_object_codes(second.communicate()[0])
     return [*codes, *(made or monitor_object_code())]
 
 
@@ -116,14 +116,16 @@ def avoidance_object_code() -> list[bytes]:
 
 def solids_object_code() -> list[bytes]:
     """Object code of the monitor of obstacles that move or are no plain boxes."""
-    from rigidfleet.kernel.obstacles import watch_step
+    from rigidfleet.kernel.obstacles import watch_clearances
 
     row_of = monitor.trail_row_of
 
     def watch_solids(first, end, p, state, watch, s):
         for step in range(first, end):
             row, trail = row_of(step, state), state.trail
-            watch_step(trail.points[row], trail.clock[row, 0], trail.clock[row, 1], p, s, watch)
+            watch_clearances(
+                trail.points[row], trail.clock[row, 0], trail.clock[row, 1], p, s, watch
+            )
 
     kinds = types.int64, types.int64, Problem, IntegratorState, Monitor, Solids
     return [_object_code(*_ir_text(watch_solids, *kinds), "watch_solids", hot=())]
@@ -215,4 +217,4 @@ def main(part: str) -> None:
             objects.build_command("apart"), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
         )
         codes = flight_object_code(second)
-    sys.stdout.buffer.write(objects.join_objects(codes))
+    sys.stdout.buffer.write(objects.join_object_codes(codes))

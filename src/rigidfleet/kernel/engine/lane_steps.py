@@ -79,8 +79,8 @@ _AA, _EA, _HALF_A = A @ A, E @ A, HALF @ A
 
 
 @jit
-def forget_stages(k, first):
-    """As `dopri5.forget_stages`."""
+def zero_stages(k, first):
+    """As `dopri5.zero_stages`."""
     for s in range(first, STAGES):
         for q in range(k.shape[1]):
             k[s, q] = fill_lanes(0.0)
@@ -122,7 +122,7 @@ def _write_state(k, row, coordinates, w, x, hc, s):
 
 
 @jit_inline
-def _write_stage(k, coordinates, s, h):
+def _write_trial_state(k, coordinates, s, h):
     """Write the state of stage s, a literal."""
     _write_state(k, TRIAL, coordinates, _weights(A[s], h), _weights(_AA[s], h * h), h * C[s], s)
 
@@ -142,21 +142,21 @@ def write_stage_state(k, stage, _a, h, p):
         for q in range(k.shape[1]):
             k[TRIAL, q] = k[STATE, q]
     elif stage == 1:
-        _write_stage(k, coordinates, 1, h)
+        _write_trial_state(k, coordinates, 1, h)
     elif stage == 2:
-        _write_stage(k, coordinates, 2, h)
+        _write_trial_state(k, coordinates, 2, h)
     elif stage == 3:
-        _write_stage(k, coordinates, 3, h)
+        _write_trial_state(k, coordinates, 3, h)
     elif stage == 4:
-        _write_stage(k, coordinates, 4, h)
+        _write_trial_state(k, coordinates, 4, h)
     elif stage == 5:
-        _write_stage(k, coordinates, 5, h)
+        _write_trial_state(k, coordinates, 5, h)
     elif stage == 6:
-        _write_stage(k, coordinates, 6, h)
+        _write_trial_state(k, coordinates, 6, h)
     elif stage == 7:
-        _write_stage(k, coordinates, 7, h)
+        _write_trial_state(k, coordinates, 7, h)
     else:
-        _write_stage(k, coordinates, 8, h)
+        _write_trial_state(k, coordinates, 8, h)
 
 
 @jit_inline
@@ -287,7 +287,7 @@ INSTEAD = {
     "STATE": STATE,
     "TRIAL": TRIAL,
     "write_stage_state": write_stage_state,
-    "forget_stages": forget_stages,
+    "zero_stages": zero_stages,
     "write_step_samples": write_step_samples,
     "record_start_forces": record_start_forces,
     "squared_errors": squared_errors,

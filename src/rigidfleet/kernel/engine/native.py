@@ -34,9 +34,9 @@ from rigidfleet.kernel.compiler.levels import (
 from rigidfleet.kernel.engine.objects import (
     ENTRIES,
     compile_objects,
-    join_objects,
+    join_object_codes,
     shared_object_path,
-    split_objects,
+    split_object_codes,
     symbol_name,
     target_machine,
 )
@@ -280,7 +280,7 @@ def _read_cached_code(part: str) -> list[bytes] | None:
     """Machine code from the cache, if there is any that is safe to run."""
     try:
         with open_safely(_cache_file(part)) as stream:
-            return split_objects(stream.read())
+            return split_object_codes(stream.read())
     except OSError:
         return None
 
@@ -289,7 +289,7 @@ def _cache_code(parts: Sequence[bytes], part: str) -> None:
     """Store machine code in the cache, or warn that it will be compiled again."""
     try:
         with replace_atomically(_cache_file(part), private=True) as stream:
-            stream.write(join_objects(parts))
+            stream.write(join_object_codes(parts))
     except OSError as error:
         warn_not_cached(error)
 

@@ -32,8 +32,9 @@ ENTRIES = {
     "solids": {"watch_solids": 6},  # first, end, problem, integrator, monitor, solids
     "large": dict.fromkeys(
         (
-            "solve", "multipliers", "elimination_tree", "count_blocks", "fill_blocks", "assemble", "factor", "apply_J",
-            "apply_Jt", "inner", "project_on_solutions", "conjugate_gradients", "conjugate_gradients_single",
+            "solve", "multipliers", "elimination_tree", "count_factor_blocks", "list_factor_blocks", "assemble",
+            "factor", "apply_J", "apply_Jt", "inner", "project_on_solutions",
+            "conjugate_gradients", "conjugate_gradients_single",
         ), 1
     ),
 }  # fmt: skip
@@ -88,7 +89,7 @@ def compile_objects(part: str, of: str) -> list[bytes] | None:
                 build_command(part), env=os.environ | settings, cwd=ELSEWHERE, capture_output=True, check=False
             )  # fmt: skip
             if done.returncode == 0:
-                return split_objects(done.stdout)
+                return split_object_codes(done.stdout)
     return None
 
 
@@ -106,14 +107,14 @@ def target_machine() -> Any:
     )  # fmt: skip
 
 
-def join_objects(parts: Sequence[bytes]) -> bytes:
+def join_object_codes(parts: Sequence[bytes]) -> bytes:
     """Join objects, each after its length, with a digest, so that an incomplete file is never used."""
     code = b"".join(len(part).to_bytes(8, "little") + part for part in parts)
     return code + hashlib.sha256(code).digest()
 
 
-def split_objects(data: bytes) -> list[bytes] | None:
-    """Objects that were `join_objects`; None if they are not whole."""
+def split_object_codes(data: bytes) -> list[bytes] | None:
+    """Objects that were `join_object_codes`; None if they are not whole."""
     code, digest = data[:-32], data[-32:]
     if not code or hashlib.sha256(code).digest() != digest:
         return None

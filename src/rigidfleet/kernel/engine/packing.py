@@ -151,7 +151,7 @@ def _word_layout(kind: type) -> tuple[list[Any], struct.Struct]:
 
 def example_of(kind: type) -> Any:
     """The example of a type of named tuple."""
-    return next(x for x in (*example_tuples(), *_examples_of_large()) if isinstance(x, kind))
+    return next(x for x in (*example_tuples(), *_large_solver_examples()) if isinstance(x, kind))
 
 
 @cache
@@ -207,7 +207,7 @@ def example_tuples() -> tuple[
 
 
 @cache
-def _examples_of_large() -> tuple[Any, ...]:
+def _large_solver_examples() -> tuple[Any, ...]:
     """Examples of the arguments of each function of the solver of large formations, as named tuples."""
     k, a, b, frame = np.zeros(1, dtype=np.int64), np.zeros((1, 3)), np.zeros(1), np.eye(3)
     edges = np.zeros((1, 2), dtype=np.uint32)
@@ -227,8 +227,8 @@ def _examples_of_large() -> tuple[Any, ...]:
                   "I_inv": frame, "a": a, "f_C": a},
         "multipliers": {"u": a, "order": order, "f": a, "multiplier": b},
         "elimination_tree": tree,
-        "count_blocks": tree | {"count": k, "most": 1},
-        "fill_blocks": tree | {"free": k, "out": Pattern(*(k,) * 7)},
+        "count_factor_blocks": tree | {"count": k, "most": 1},
+        "list_factor_blocks": tree | {"free": k, "out": Pattern(*(k,) * 7)},
         "assemble": matrix | {"place": k, "column": k, "of_edge": k, "L": blocks},
         "factor": rows | {"L": blocks, "at": k},
         "apply_J": {"u": a, "edges": edges, "a": a, "scale": 1.0, "out": b},
@@ -242,7 +242,7 @@ def _examples_of_large() -> tuple[Any, ...]:
 
 
 #: The types of these named tuples, by the function's name.
-OF_LARGE = {type(x).__name__: type(x) for x in _examples_of_large()}
+OF_LARGE = {type(x).__name__: type(x) for x in _large_solver_examples()}
 
 NOTHING = np.zeros(0)
 

@@ -166,9 +166,9 @@ class Trace:
 
     def add(self, a: Any, b: Any) -> Any:
         """Return a + b."""
-        if _is_number(a, 0.0):
+        if _equals_number(a, 0.0):
             return b
-        if _is_number(b, 0.0):
+        if _equals_number(b, 0.0):
             return a
         return self.symbol("add", a, b)
 
@@ -176,20 +176,20 @@ class Trace:
         """Return a - b."""
         if a is b:
             return 0.0
-        if _is_number(b, 0.0):
+        if _equals_number(b, 0.0):
             return a
-        if not _is_number(a, 0.0):
+        if not _equals_number(a, 0.0):
             return self.symbol("sub", a, b)
         return b.arguments[0] if b.operation == "neg" else self.symbol("neg", b)
 
     def multiply(self, a: Any, b: Any) -> Any:
         """Return a b."""
         for x, y in ((a, b), (b, a)):
-            if _is_number(x, 0.0):
+            if _equals_number(x, 0.0):
                 return 0.0
-            if _is_number(x, 1.0):
+            if _equals_number(x, 1.0):
                 return y
-            if _is_number(x, -1.0):
+            if _equals_number(x, -1.0):
                 return self.subtract(0.0, y)
         # So that x y and y x are the same symbol.
         swap = isinstance(b, Symbol) and (not isinstance(a, Symbol) or b.serial < a.serial)
@@ -218,7 +218,7 @@ class Trace:
             total = total * xx + weight
         return total
 
-    def _checked_angle(self, x: Any) -> Any:
+    def _angle_square(self, x: Any) -> Any:
         """The square of an angle [rad], which must not be too wide for the series."""
         xx = x * x
         self._refuse_wide_angle(xx)
@@ -229,13 +229,13 @@ class Trace:
             self.positive.append(self.subtract(_WIDEST, xx))
 
     def _sine(self, x: Any) -> Any:
-        return x * self._series(self._checked_angle(x), 1) if isinstance(x, Symbol) else math.sin(x)
+        return x * self._series(self._angle_square(x), 1) if isinstance(x, Symbol) else math.sin(x)
 
     def _cosine(self, x: Any) -> Any:
-        return self._series(self._checked_angle(x), 0) if isinstance(x, Symbol) else math.cos(x)
+        return self._series(self._angle_square(x), 0) if isinstance(x, Symbol) else math.cos(x)
 
-    def _rate_factors(self, xx: Any, s: Any) -> tuple[Any, ...]:
-        """As `control.rate_factors`, without its branch."""
+    def _body_rate_factors(self, xx: Any, s: Any) -> tuple[Any, ...]:
+        """As `control.body_rate_factors`, without its branch."""
         self._refuse_wide_angle(xx)
         a, b = self._series(xx, 2), self._series(xx, 3)
         twice = s + s
@@ -270,9 +270,9 @@ class Trace:
             "piece_at": lambda *_: (0, *time(SINCE), 0.0),
             # The step of a table has been replaced by the place of its weights.
             "spline_weights": lambda _, k, __: (0, *time(*range(k, k + 4))),
-            "rate_factors": self._rate_factors,
+            "body_rate_factors": self._body_rate_factors,
             "where_positive": lambda x, a, b: self.symbol("where_positive", x, a, b),
-            "surely_positive": lambda _: False,  # not known
+            "is_known_positive": lambda _: False,  # not known
         }
         worlds: dict[int, dict[str, Any]] = {}
 
@@ -549,7 +549,7 @@ def _separate_numbers(x: Any, numbers: list[Floats], others: list[Any]) -> None:
         others.append(x.tolist() if isinstance(x, np.ndarray) else x)
 
 
-def _is_number(x: Any, number: float) -> bool:
+def _equals_number(x: Any, number: float) -> bool:
     return not isinstance(x, Symbol) and x == number
 
 

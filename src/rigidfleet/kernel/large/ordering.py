@@ -8,7 +8,7 @@ from rigidfleet.kernel.records import Order, Pattern
 from rigidfleet.typing import Ints
 
 
-def prepare_order(steps: Ints, edges: NDArray[np.integer]) -> Order:
+def pivot_order(steps: Ints, edges: NDArray[np.integer]) -> Order:
     """Prepare an order from steps (N, 4), an agent and its edges (-1: none), and edges (m, 2)."""
     agent, edge = steps[:, 0], np.maximum(steps[:, 1:], 0)
     ends = edges[edge].astype(np.int64)
@@ -19,7 +19,7 @@ def prepare_order(steps: Ints, edges: NDArray[np.integer]) -> Order:
 
 
 def symbolic_factorisation(n: int, edges: NDArray[np.integer], order: Ints, most: float) -> Pattern:
-    """Pattern of L with agents eliminated in ``prepare_order`` (N,).
+    """Pattern of L with agents eliminated in ``pivot_order`` (N,).
 
     If there are more than ``most`` blocks per agent, fill is omitted: the pattern is that of K.
     """
@@ -32,11 +32,11 @@ def symbolic_factorisation(n: int, edges: NDArray[np.integer], order: Ints, most
     parent, mark, count = (np.full(n, -1) for _ in range(3))
     native.call_large("elimination_tree", first, left, parent, mark)
     mark[:], count[:] = -1, 1
-    fill = native.call_large("count_blocks", first, left, parent, mark, count, int(most * n))
+    fill = native.call_large("count_factor_blocks", first, left, parent, mark, count, int(most * n))
     if not fill:
         parent[:] = -1  # no fill is inherited
         mark[:], count[:] = -1, 1
-        native.call_large("count_blocks", first, left, parent, mark, count, 1 << 62)
+        native.call_large("count_factor_blocks", first, left, parent, mark, count, 1 << 62)
     column = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
     blocks = int(column[-1])
     blocks_of = Pattern(
@@ -45,7 +45,7 @@ def symbolic_factorisation(n: int, edges: NDArray[np.integer], order: Ints, most
     )  # fmt: skip
     mark[:] = -1
     next_ = column[:-1].copy()
-    native.call_large("fill_blocks", first, left, parent, mark, next_, blocks_of)
+    native.call_large("list_factor_blocks", first, left, parent, mark, next_, blocks_of)
     key = (
         np.repeat(np.arange(n), np.diff(column)) * n + blocks_of.row
     )  # sorted, as rows are in a column

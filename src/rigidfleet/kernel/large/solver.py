@@ -90,14 +90,14 @@ class LargeSolver:
         # Not needed as long as elimination succeeds
         self.pattern: Pattern | None = None
         self.pulled = True  # whether the workspace has the multipliers of the last evaluation
-        self._calls = [_c_callback(method) for method in (self._solve, self._find_multipliers)]
+        self._calls = [_c_callback(method) for method in (self._try_solve, self._try_multipliers)]
         self.address, self.multipliers = (
             int(ctypes.cast(call, ctypes.c_void_p).value or 0) for call in self._calls
         )
         if self.setup.elimination is None:
             self.multipliers = 0
 
-    def _solve(self) -> None:
+    def _try_solve(self) -> None:
         # An exception cannot pass through compiled code; the forces become NaN.
         try:
             if self.error is None:
@@ -108,7 +108,7 @@ class LargeSolver:
             self.error = error
         self._fill_results_with_nan()
 
-    def _find_multipliers(self) -> None:
+    def _try_multipliers(self) -> None:
         try:
             self.find_multipliers()
         except BaseException as error:
@@ -144,7 +144,7 @@ class LargeSolver:
             if not self.pulled:
                 return
             self.counts.fallbacks += 1
-        if not np.isfinite(w.b).all() or not self._solve_at_agents():
+        if not np.isfinite(w.b).all() or not self._solve_in_agent_space():
             self.counts.failures += 1
             self._fill_results_with_nan()
         elif order is not None:
@@ -159,8 +159,8 @@ class LargeSolver:
             self.a[:] = w.f_C
             call_large("multipliers", w.u, order, self.a, w.multiplier)
 
-    def _solve_at_agents(self) -> bool:
-        """Iterated Tikhonov in the agents' coordinates, see `constraint.solve_at_agents`.
+    def _solve_in_agent_space(self) -> bool:
+        """Iterated Tikhonov in the agents' coordinates, see `constraint.solve_in_agent_space`.
 
         The exact law uses the same solve with almost no damping. Its multipliers would be differences of large
         numbers, so they are found from J^T lambda = M a in the same way.

@@ -58,7 +58,7 @@ class Ball:
         if not np.array_equal(velocity, self.velocity):
             self.velocity, self.changed = velocity, True
 
-    def note_turn(self, t: float) -> None:
+    def note_way_corner(self, t: float) -> None:
         """Note where its velocity changes, at t [s]."""
         if self.turns and self.turns[-1][0] >= t:
             self.turns.pop()

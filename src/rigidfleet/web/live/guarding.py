@@ -16,7 +16,7 @@ _MOST = 100
 _CLEARANCE = 0.1
 
 
-def with_avoidance(mission: Mission) -> tuple[Mission, str]:
+def with_avoidance_or_reason(mission: Mission) -> tuple[Mission, str]:
     """The mission with [avoidance], and why not if that is impossible.
 
     Points fly as vehicles of the model "point", with the same mass, thrust limit and drag. The mission's text then has

@@ -132,7 +132,7 @@ class Pilot:
         self.a, self.alpha = np.zeros(3), np.zeros(3)
         x, y, z = self.pose.r
         size = np.linalg.norm(self._slots, axis=1).max() + max(mission.agents.radius)
-        clear = float(mission.height_at(x, y, z)) + size + 0.5  # to rotate above the ground
+        clear = float(mission.height_below(x, y, z)) + size + 0.5  # to rotate above the ground
         heading = att.euler_from_dcm(self.pose.T) * [0, 0, 1]
         self.target = PilotTarget(np.array([x, y, max(z, clear)]), heading)
         self.last: Result | None = None
@@ -176,7 +176,7 @@ class Pilot:
         far = float(np.linalg.norm(slots - before, axis=1).max())
         share = np.linspace(0.0, 1.0, math.ceil(far / _LOOK) + 2)[1:, None, None]
         way = before + share * (slots - before)  # straight and in step
-        room, agent, which = self._least_room(way, self.target.r[None, None], self.target.attitude)
+        room, agent, which = self._clearances(way, self.target.r[None, None], self.target.attitude)
         k = int(room.argmin())
         if formation != self.formation and room[k] < 0.0:
             name = self.at_rest[which[k]].name
@@ -382,17 +382,17 @@ class Pilot:
     def _move_target(self, h: float) -> None:
         """Move and turn the target as commanded, but no slot deeper into an obstacle or the ground."""
         target, slots = self.target, self._slots
-        room, _, _ = self._least_room(slots, target.r[None, None], target.attitude)
+        room, _, _ = self._clearances(slots, target.r[None, None], target.attitude)
         least = min(float(room[0]), 0.0)
 
-        def obstacle_on(path: Floats, T: Floats) -> str:
+        def blocking_obstacle_name(path: Floats, T: Floats) -> str:
             """What a slot would be deeper in somewhere on a path (K, 3), "" for nothing."""
-            after, _, which = self._least_room(slots, path[:, None], T)
+            after, _, which = self._clearances(slots, path[:, None], T)
             return "" if (after >= least).all() else self.at_rest[which[int(after.argmin())]].name
 
         turned = target.euler + h * target.turn
         turned[1] = np.clip(turned[1], -1.2, 1.2)  # clear of the poles
-        held_off = obstacle_on(target.r[None], att.dcm_from_euler(turned))
+        held_off = blocking_obstacle_name(target.r[None], att.dcm_from_euler(turned))
         if not held_off:
             target.euler = turned
         way = h * target.move
@@ -402,7 +402,7 @@ class Pilot:
             if not looks:
                 continue
             path = target.r + np.linspace(0.0, 1.0, looks + 1)[1:, None] * part
-            if name := obstacle_on(path, target.attitude):
+            if name := blocking_obstacle_name(path, target.attitude):
                 held_off = name
                 continue
             target.r = target.r + part
@@ -417,7 +417,7 @@ class Pilot:
         assert slots is not None  # every formation flown has slots
         return slots
 
-    def _least_room(self, slots: Floats, r: Floats, T: Floats) -> tuple[Floats, Ints, Ints]:
+    def _clearances(self, slots: Floats, r: Floats, T: Floats) -> tuple[Floats, Ints, Ints]:
         """Least room (K,) [m] of slots (N, 3) or (K, N, 3) beside obstacles at rest, agent and obstacle (K,).
 
         The body is at r (K or 1, 1, 3), in an attitude T (3, 3).
@@ -431,7 +431,7 @@ class Pilot:
         for ball in self.flying_balls:
             ball.follow_goal()
             if ball.changed:
-                ball.note_turn(self.t)
+                ball.note_way_corner(self.t)
                 self.moved = True
         if self.moved:
             self.moved = False

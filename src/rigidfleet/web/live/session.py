@@ -19,10 +19,10 @@ from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.result import Result
 from rigidfleet.web.live.balls import AT_ONCE, FASTEST, LARGEST, SMALLEST
-from rigidfleet.web.live.guarding import with_avoidance
+from rigidfleet.web.live.guarding import with_avoidance_or_reason
 from rigidfleet.web.live.pilot import TICK, Pilot
-from rigidfleet.web.replay.page import page, page_text
-from rigidfleet.web.replay.scene import describe_scene, page_samples, sight_points, vehicle_weight
+from rigidfleet.web.replay.page import asset_text, page
+from rigidfleet.web.replay.scene import describe_scene, page_samples, scene_points, vehicle_weight
 
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 #: Full colour of an edge, as a share of a vehicle's weight.
@@ -47,7 +47,7 @@ class Session:
     """
 
     def __init__(self, mission: Mission, landed: Callable[[Result], str] | None = None) -> None:
-        self.mission, self.unguarded = with_avoidance(mission)
+        self.mission, self.unguarded = with_avoidance_or_reason(mission)
         self.landed = landed
         self.flown: Result | None = None  # the last flight that ended
         self.farewell = ""
@@ -69,7 +69,7 @@ class Session:
         columns = page_samples(self.result, self.shown, self.tension)
         start = self.mission.fleet.position
         ends = start.min(axis=0) - _AROUND, start.max(axis=0) + _AROUND
-        near = sight_points(self.mission, *ends)
+        near = scene_points(self.mission, *ends)
         #: Columns are those of the beginning: pages read numbers one after the other.
         widths = {name: math.prod(c.values.shape[1:]) for name, c in columns.items()}
         widths |= {"target": 7, "balls": 4 * AT_ONCE}
@@ -106,7 +106,7 @@ class Session:
         """The page."""
         with self.lock:
             info = self.info | self.page_state()
-        return page(info, start="live/live.js", style=page_text("live/live.css"), connect="'self'")
+        return page(info, start="live/live.js", style=asset_text("live/live.css"), connect="'self'")
 
     def page_state(self) -> dict[str, Any]:
         """Information that changes only now and then."""
@@ -176,20 +176,20 @@ class Session:
         with self.lock:
             match order:
                 case {"move": move, "turn": turn}:
-                    self.pilot.steer(_vector(move, _FASTEST), _vector(turn, _TURNING))
+                    self.pilot.steer(_as_vector(move, _FASTEST), _as_vector(turn, _TURNING))
                 case {"formation": str(name)} if name in self.pilot.formations:
                     self.pilot.change_formation(name)
                 case {"gust": direction, "strength": strength}:
                     strength = _clamped_number(strength, _STRONGEST)
-                    direction = _vector(direction, 1.0)
+                    direction = _as_vector(direction, 1.0)
                     if not np.linalg.norm(direction) > 0.0:  # the square of a tiny one is 0
                         raise ValueError("a gust needs a direction")
                     self.pilot.send_gust(direction, strength)
                 case {"ball": place, "radius": radius, "velocity": velocity}:
-                    place, velocity = _vector(place, _FARTHEST), _vector(velocity, _FASTEST)
+                    place, velocity = _as_vector(place, _FARTHEST), _as_vector(velocity, _FASTEST)
                     self.pilot.add_ball(place, _clamped_number(radius, _FARTHEST), velocity)
                 case {"pull": int(slot), "to": place}:
-                    goal = None if place is None else _vector(place, _FARTHEST)
+                    goal = None if place is None else _as_vector(place, _FARTHEST)
                     self.pilot.pull_ball(slot, goal)
                 case {"remove": int(slot)}:
                     self.pilot.remove_ball(slot)
@@ -274,7 +274,7 @@ def _clamped_number(value: Any, most: float) -> float:
     return float(min(max(value, -most), most))
 
 
-def _vector(value: Any, most: float) -> np.ndarray:
+def _as_vector(value: Any, most: float) -> np.ndarray:
     if not isinstance(value, list) or len(value) != 3:
         raise ValueError("the value must be a list of three numbers")
     return np.array([_clamped_number(x, most) for x in value])

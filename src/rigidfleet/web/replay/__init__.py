@@ -26,7 +26,7 @@ from rigidfleet.web.replay.page import page
 from rigidfleet.web.replay.scene import (
     describe_scene,
     page_samples,
-    sight_points,
+    scene_points,
     typical_formation_radius,
     vehicle_weight,
 )
@@ -159,7 +159,7 @@ def _flight_information(result: Result, time: Floats) -> dict[str, Any]:
     """Information on the page about a finished flight."""
     low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
     extent, reach = float(np.linalg.norm(high - low)) / 2, typical_formation_radius(result)
-    seen = sight_points(result.mission, low, high)
+    seen = scene_points(result.mission, low, high)
     least, most = seen.min(axis=0), seen.max(axis=0)
     way = (result.cm[-1] - result.cm[0])[:2]
     far = float(np.linalg.norm(way)) > 2 * reach

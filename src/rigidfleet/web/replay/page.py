@@ -29,7 +29,7 @@ def page(
     style : CSS in addition to that of every page
     connect : hosts that the page may connect to; see `content_policy`
     """
-    style = page_text("replay/page.css") + style
+    style = asset_text("replay/page.css") + style
     script = bundle_module(start)
     template = templates("rigidfleet.web.replay", "").get_template("page.html")
     return template.render(
@@ -54,7 +54,7 @@ def bundle_module(start: str) -> str:
     def module_texts(name: str) -> Iterator[str]:
         if name not in seen:
             seen.add(name)
-            text = page_text(name)
+            text = asset_text(name)
             for target in _IMPORT.findall(text):
                 yield from module_texts(
                     posixpath.normpath(posixpath.join(posixpath.dirname(name), target))
@@ -64,6 +64,6 @@ def bundle_module(start: str) -> str:
     return "\n".join(module_texts(start))
 
 
-def page_text(name: str) -> str:
+def asset_text(name: str) -> str:
     """Text of a file below the package of the pages."""
     return (resources.files("rigidfleet.web") / name).read_text(encoding="utf-8")

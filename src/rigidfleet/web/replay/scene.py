@@ -164,7 +164,7 @@ def _optional_columns(
         yield "doubt", PackedColumn(off.doubt, fine)
 
 
-def sight_points(mission: Mission, low: Floats, high: Floats) -> Floats:
+def scene_points(mission: Mission, low: Floats, high: Floats) -> Floats:
     """Points (P, 3) [m] that an overview shows: 8 corners of the flight's box, then those of obstacles near it.
 
     An obstacle is cut at the distance from the flight that equals the flight's length, the way of one that moves
