@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from rigidfleet.formation.shapes import SHAPES, agents_text, slots
+from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
 from rigidfleet.math.margins import (
     Lag,
     LoopGains,
@@ -148,7 +148,7 @@ def _quoted(value: Any) -> str:
 
 def _shapes() -> str:
     """The named shapes: name, agents, slots."""
-    rows = [(f"`{name}`", agents_text(name), shape.text) for name, shape in SHAPES.items()]
+    rows = [(f"`{name}`", agents_taken(name), shape.text) for name, shape in SHAPES.items()]
     return _table_symbols(("shape", "agents", "slots"), rows)
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull
 
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.rigidity import RigidityClass, analyse, full_rank, jacobian
-from rigidfleet.rigidity.design import design, formation_toml, free_motions_text
+from rigidfleet.rigidity.design import design, free_motions_text, mission_fragment
 
 CUBE = shapes.slots("cube", 4.0, 8)
 BEST_CUBE = (3 - np.sqrt(5)) / 2  # 0.38197
@@ -159,6 +159,6 @@ def test_fragment_is_toml_of_a_formation(name):
     """The fragment reads back as the formation it was made of, whatever its name."""
     p = shapes.slots("icosahedron", 3.0, 12)
     edges = design(p)
-    table = tomllib.loads(formation_toml(name, p, edges))["formations"][name]
+    table = tomllib.loads(mission_fragment(name, p, edges))["formations"][name]
     assert table["slots"] == p.tolist()
     assert table["edges"] == (edges + 1).tolist()

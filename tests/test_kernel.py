@@ -564,7 +564,7 @@ def test_only_edges_that_share_an_agent_are_assembled():
     w = workspace(6, 6)
     at_rest = np.zeros((6, 3))
     law = ConstraintLaw(1.0, 1.0, 0.0, EXACT, 0.0, 1, 0.0, 0.0, 0.0)
-    constraint.constraint_rhs(r, at_rest, np.zeros(6), at_rest, graph.edges, law, w)
+    constraint.right_side(r, at_rest, np.zeros(6), at_rest, graph.edges, law, w)
     constraint.assemble(w.u, graph, 1.7, 0.3, w.A)
     J = jacobian(r, edges)
     expected = 1.7 * (J / np.repeat(m, 3)) @ J.T + 0.3 * np.eye(6)
@@ -612,7 +612,7 @@ def test_desired_agents_move_as_their_derivatives_say():
     def desired(t: float) -> np.ndarray:
         references.blend_slots(t, problem.reference, w.p, w.p_dot, w.p_ddot)
         control.reference_motion(t, problem.motion, w)
-        control.desired_positions(w)
+        control.desired_agents(w)
         return np.array([w.r_ref, w.v_ref, w.a_ref])
 
     for t in (0.4, 1.7, 3.3):

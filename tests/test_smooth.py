@@ -56,7 +56,7 @@ def flown(reference: Reference, motion: Motion, t: float) -> np.ndarray:
     w = workspace(len(reference.p0), 0)
     references.blend_slots(t, reference, w.p, w.p_dot, w.p_ddot)
     control.reference_motion(t, motion, w)
-    control.desired_positions(w)
+    control.desired_agents(w)
     return np.array([w.r_ref, w.v_ref, w.a_ref])
 
 

@@ -379,7 +379,7 @@ def test_points_have_a_path_in_tables_and_no_attitude():
         t = (first + row) / mission.autopilot.rate
         references.blend_slots(t, problem.reference, w.p, w.p_dot, w.p_ddot)
         control.reference_motion(t, problem.motion, w)
-        control.desired_positions(w)
+        control.desired_agents(w)
         np.testing.assert_allclose(made.path[row], np.hstack([w.r_ref, w.v_ref]), atol=1e-9)
     assert np.ptp(made.path[:, :, 0], axis=0).min() > 0.1  # they move
     before = tables.switch_path(problem, first + 250, made)

@@ -90,7 +90,7 @@ def constraint_force(
         float(threshold), float(cutoff), 0.0,
     )  # fmt: skip
     a = np.ascontiguousarray(f / m[:, None])
-    constraint.constraint_rhs(r, v, _broadcast(integral, (e,), "integral"), a, graph.edges, law, w)
+    constraint.right_side(r, v, _broadcast(integral, (e,), "integral"), a, graph.edges, law, w)
     if e and not w.L.min() > 0.0:
         i, j = graph.edges[w.L.argmin()]
         raise ValueError(f"agents {i} and {j} coincide: their edge has no direction")

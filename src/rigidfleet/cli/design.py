@@ -97,7 +97,7 @@ def design(
             kinds[edges] = GRAPHS[edges](slots, REACH if reach is None else reach)
         chosen = [] if edges == "none" else edges or kinds["designed"]
         text = "".join(f"# {note}\n" for note in notes)
-        text += designs.formation_toml(name, slots, chosen, reach)
+        text += designs.mission_fragment(name, slots, chosen, reach)
         if colours is not None:
             text += f"colour = {dumps(colours)}\n"
         judged = {what: rigidity_data_and_row(slots, graph) for what, graph in kinds.items()}
@@ -204,7 +204,7 @@ def load_shape_points(
 
     from rigidfleet.formation import outlines
     from rigidfleet.formation.point_files import Points, read_points
-    from rigidfleet.formation.shapes import SHAPES, agents_text, slots
+    from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
     from rigidfleet.math.rigid_body import centred
     from rigidfleet.mission.findings import suggest_shape
 
@@ -219,7 +219,7 @@ def load_shape_points(
         if spacing is not None:
             raise ValueError("--spacing has no effect on a named shape; use --size")
         if agents is None and len(form.agents) > 1:
-            raise ValueError(f"takes {agents_text(shape)}; give --agents")
+            raise ValueError(f"takes {agents_taken(shape)}; give --agents")
         return shape, Points(slots(shape, size or [4.0] * form.sizes, count), None)
     if letters is None and not Path(shape).exists():
         if Path(shape).suffix or len(Path(shape).parts) > 1:

@@ -185,7 +185,7 @@ _SHOWN = 100
 
 def _ask_for_mission(name: str) -> tuple[str, dict[str, Any]]:
     """Ask for the name and the numbers of a new mission, one by one. An empty answer accepts the default."""
-    from rigidfleet.formation.shapes import SHAPES, agents_text, slots
+    from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
     from rigidfleet.mission import draft
 
     def ask_until_valid(question: str, offered: str, take: Callable[[str], Any]) -> Any:
@@ -225,7 +225,7 @@ def _ask_for_mission(name: str) -> tuple[str, dict[str, Any]]:
     answers: dict[str, Any] = {"shape": shape}
     usual = draft.agents_for(shape)
     if len(SHAPES[shape].agents) > 1:
-        answers["agents"] = ask_until_valid(f"Vehicles ({agents_text(shape)})", str(usual), count)
+        answers["agents"] = ask_until_valid(f"Vehicles ({agents_taken(shape)})", str(usual), count)
     answers["size"] = [ask_until_valid("Edge length [m]", f"{draft.SIZE:g}", parse_positive)]
     answers["mass"] = ask_until_valid("Mass of each [kg]", f"{draft.MASS:g}", parse_positive)
     there = " ".join(f"{x:g}" for x in draft.WAYPOINT)

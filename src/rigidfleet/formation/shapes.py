@@ -228,7 +228,7 @@ def slots(shape: str, size: float | Sequence[float], n: int) -> Floats:
     form = SHAPES[shape]
     sizes = np.atleast_1d(np.asarray(size, dtype=np.float64))
     if n not in form.agents:
-        raise ValueError(f"shape {shape!r} takes {agents_text(shape)}, not {n}")
+        raise ValueError(f"shape {shape!r} takes {agents_taken(shape)}, not {n}")
     if sizes.shape != (form.sizes,):
         names = "[radius, rise per turn, distance]" if shape == "helix" else "[x, y, z]"
         wanted = "one size, its edge length" if form.sizes == 1 else f"{form.sizes} sizes {names}"
@@ -238,7 +238,7 @@ def slots(shape: str, size: float | Sequence[float], n: int) -> Floats:
     return centred(form.make(sizes, n))
 
 
-def agents_text(shape: str) -> str:
+def agents_taken(shape: str) -> str:
     """The number of agents of a named shape, in words."""
     taken = SHAPES[shape].agents
     if len(taken) == 1:

@@ -28,7 +28,7 @@ def constraint_force(t, y, dy, p, w):
     for i in range(n):
         for s in range(3):
             w.a[i, s] = vehicles.inverse[i] * (w.f_E[i, s] + w.f_u[i, s])
-    constraint_rhs(w.r, w.v, y[6 * n : 6 * n + m], w.a, graph.edges, p.law, w)
+    right_side(w.r, w.v, y[6 * n : 6 * n + m], w.a, graph.edges, p.law, w)
     solve_multipliers(vehicles, graph, p.law, w)
     if graph.multipliers == 0:
         apply_multipliers(w.u, graph.edges, w.multiplier, w.f_C)
@@ -37,7 +37,7 @@ def constraint_force(t, y, dy, p, w):
 
 
 @jit_inline
-def constraint_rhs(r, v, integral, a, edges, law, w):
+def right_side(r, v, integral, a, edges, law, w):
     """Edges at positions r and velocities v (N, 3), and the bracket of Eq. (12).
 
     Fills w.u (m, 3) with unit vectors and w.L (m,) [m] with lengths, w.c with the
@@ -102,7 +102,7 @@ def solve_multipliers(vehicles, graph, law, w):
     b, y = w.b, w.multiplier
     mbar = vehicles.mean
     if w.A.shape[0] < n:
-        solve_in_agent_space(m, mbar, graph.edges, law, w)
+        solve_at_agents(m, mbar, graph.edges, law, w)
         return
     mu, iterations = (law.mu, law.iterations) if law.solver == ITERATED else (0.0, 1)
     # Spectral damping equals the exact law if all w >= s0, that is, if mbar A - s0 is definite. The pseudo-inverse
@@ -159,7 +159,7 @@ def solve_by_eigenvalues(graph, mbar, law, w):
 
 
 @jit
-def solve_in_agent_space(m, mbar, edges, law, w):
+def solve_at_agents(m, mbar, edges, law, w):
     """The iterated solve in the agents' coordinates, which is the smaller system if there are many edges.
 
     With K = mbar J^T J + mu M (3N, 3N), each iteration is a += mbar K^-1 J^T (b - J a), and the

@@ -35,7 +35,7 @@ def _body_rate_factors_closed(xx, s):
 
 
 @jit
-def body_rate_factors(xx, s):
+def rate_factors(xx, s):
     """a, b and their derivatives over time, of `body_rates`, for xx = |phi|^2 and s = phi . dphi/dt."""
     return _body_rate_factors_series(xx, s) if xx < 0.04 else _body_rate_factors_closed(xx, s)
 
@@ -49,7 +49,7 @@ def body_rates(phi, phi_dot, phi_ddot, omega, omega_dot):
     """
     xx = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     s = phi[0] * phi_dot[0] + phi[1] * phi_dot[1] + phi[2] * phi_dot[2]  # x dx/dt
-    a, b, a_dot, b_dot = body_rate_factors(xx, s)
+    a, b, a_dot, b_dot = rate_factors(xx, s)
     for q in range(3):
         i, j = (q + 1) % 3, (q + 2) % 3
         pv_i = phi[j] * phi_dot[q] - phi[q] * phi_dot[j]  # components of phi x phi_dot
@@ -86,7 +86,7 @@ def exp_transposed(phi, E):
 
 
 @jit
-def compose_rotations(E, T, out):
+def rotate_after(E, T, out):
     """out = E T for (3, 3) matrices."""
     for i in range(3):
         for j in range(3):
@@ -123,11 +123,11 @@ def reference_motion(t, motion, w):
         body[row + 2, q % 3] = second
     body_rates(body[5], body[6], body[7], body[3], body[4])
     exp_transposed(body[5], w.E)
-    compose_rotations(w.E, motion.T1, w.T_ref)
+    rotate_after(w.E, motion.T1, w.T_ref)
 
 
 @jit_inline
-def desired_positions(w):
+def desired_agents(w):
     """Desired position of each agent, r_i = r_cm + T^T p_i, and two derivatives, into w.r_ref etc.
 
     v_i = v_cm + T^T (dp + omega x p), which is Eq. (22),
@@ -158,7 +158,7 @@ def local_law(t, p, w):
     """
     r, v, m, g, control = w.r, w.v, p.vehicles.m, p.vehicles.g, p.control
     reference_motion(t, p.motion, w)
-    desired_positions(w)
+    desired_agents(w)
     for q in range(6):
         w.wrench[q] = 0.0
     for i in range(r.shape[0]):
@@ -216,7 +216,7 @@ def body_law(t, p, w):
     for q in range(3):
         turned[q] = feedback.omega[q] * since
     exp_transposed(turned, w.E)
-    compose_rotations(w.E, feedback.T1, w.T_ref)
+    rotate_after(w.E, feedback.T1, w.T_ref)
     # Exp(phi) = T_ref T^T; phi in body axes, common to both frames.
     for i in range(3):
         for j in range(3):

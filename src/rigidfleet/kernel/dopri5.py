@@ -50,7 +50,7 @@ _D = np.array(
 
 
 @jit
-def zero_stages(k, first):
+def forget_stages(k, first):
     """Set the stages from ``first`` on to zero: NaN in them would survive a weight of zero."""
     for s in range(first, 7):
         for q in range(k.shape[1]):
@@ -92,7 +92,7 @@ def squared_errors(k, h, rtol, p):
 
 
 @jit_inline
-def time_to_knot(t, step):
+def until_knot(t, step):
     """Time from t to the next knot [s]; knots are every ``step`` from 0, and one that t just meets has passed."""
     return (math.floor(t / step + 1e-6) + 1.0) * step - t
 
@@ -113,9 +113,9 @@ def step_to_knot(t, h, t_end, disturbance):
     if disturbance.noise_r.shape[0] == 0 and disturbance.gust.shape[0] == 0:
         return min(h, rest)
     if disturbance.noise_r.shape[0] > 0:
-        rest = min(rest, time_to_knot(t, disturbance.noise_step))
+        rest = min(rest, until_knot(t, disturbance.noise_step))
     if disturbance.gust.shape[0] > 0:
-        rest = min(rest, time_to_knot(t, disturbance.gust_step))
+        rest = min(rest, until_knot(t, disturbance.gust_step))
     return rest / max(1.0, math.ceil(rest / h - 0.05))
 
 
@@ -194,7 +194,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     k = as_lanes(K)
     t, h, last = clock[TIME], clock[NEXT_STEP], clock[LAST_ERROR]
     if fresh:
-        zero_stages(k, 0)
+        forget_stages(k, 0)
     first = 0 if fresh else 1
     status = PAUSED
     for _ in range(max_steps):
@@ -217,7 +217,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
             if error < math.inf:
                 shrink = 0.9 * error**-0.2
             else:
-                zero_stages(k, 1)
+                forget_stages(k, 1)
             h *= max(0.1, shrink)
             if h < 1e-12 * max(1.0, abs(t)):
                 status = COLLAPSED

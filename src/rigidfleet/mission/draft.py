@@ -109,7 +109,7 @@ def draft(
         title=f"{n} vehicles fly as a {shape}" if n > 1 else "One vehicle flies",
         mass=f"{mass:g}", start=[_toml_row(place) for place in start], below=below, step=output_step(n, lasts),
         radius=f"{radius:.3g}", thrust=f"{limit:g}", shape=shape, size=extent, many=n > _ALL_PAIRS,
-        takes=shapes.agents_text(shape), text=shapes.SHAPES[shape].text, separation=f"{min(0.5, nearest / 6):.3g}",
+        takes=shapes.agents_taken(shape), text=shapes.SHAPES[shape].text, separation=f"{min(0.5, nearest / 6):.3g}",
         # In a small spatial shape, or one of many agents, some agents pass below others in any case.
         warned=below and (distance_geometry.dimension(slots) < 3 or nearest >= 3.0),
         aloft=_toml_row(aloft), climb=climb, blend=blend, settle=_SETTLE, flights=flights, hold=_HOLD,

@@ -46,7 +46,7 @@ def slot_derivatives(
     """Position, velocity, acceleration, jerk and snap (K, 5, N, 3) [m, m/s, ...] of each slot, world axes.
 
     r_i = r_cm + T1^T Exp(phi) p_i, with slots p_i = Exp(s turn) (p0_i + s dp_i) or on their ways, as in the kernel's
-    `desired_positions` and `blend_slots`; at times (K,) [s] of a phase's problem with control "tracking". At a knot,
+    `desired_agents` and `blend_slots`; at times (K,) [s] of a phase's problem with control "tracking". At a knot,
     the piece after it counts. With fewer ``orders``, the last ones are left out.
     """
     derivatives = series.derivatives(

@@ -128,7 +128,7 @@ def free_motions_text(slots: ArrayLike) -> str:
     )
 
 
-def formation_toml(
+def mission_fragment(
     name: str, slots: ArrayLike, edges: ArrayLike | str, reach: float | None = None
 ) -> str:
     """A formation as a part of a mission file, agents counted from 1.

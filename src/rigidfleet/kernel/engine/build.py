@@ -38,8 +38,8 @@ from rigidfleet.solids.records import Solids
 #: Functions that every evaluation calls, to be inlined; calls would take a tenth of a small formation's time.
 _HOT = (
     "closed_loop", "input_law", "constraint_force", "mean_axes", "centre_of_mass", "inertia",
-    "inertia_inverse", "multiply", "damp_deformation", "reference_motion", "desired_positions", "local_law", "septic",
-    "blend_slots", "distance_references", "constraint_rhs", "solve_multipliers", "assemble", "cholesky",
+    "inertia_inverse", "multiply", "damp_deformation", "reference_motion", "desired_agents", "local_law", "septic",
+    "blend_slots", "distance_references", "right_side", "solve_multipliers", "assemble", "cholesky",
     "cholesky_solve", "apply_multipliers",
 )  # fmt: skip
 #: The same of sampled flights.

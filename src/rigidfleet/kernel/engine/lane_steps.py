@@ -79,8 +79,8 @@ _AA, _EA, _HALF_A = A @ A, E @ A, HALF @ A
 
 
 @jit
-def zero_stages(k, first):
-    """As `dopri5.zero_stages`."""
+def forget_stages(k, first):
+    """As `dopri5.forget_stages`."""
     for s in range(first, STAGES):
         for q in range(k.shape[1]):
             k[s, q] = fill_lanes(0.0)
@@ -287,7 +287,7 @@ INSTEAD = {
     "STATE": STATE,
     "TRIAL": TRIAL,
     "write_stage_state": write_stage_state,
-    "zero_stages": zero_stages,
+    "forget_stages": forget_stages,
     "write_step_samples": write_step_samples,
     "record_start_forces": record_start_forces,
     "squared_errors": squared_errors,

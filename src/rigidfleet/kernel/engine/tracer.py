@@ -234,8 +234,8 @@ class Trace:
     def _cosine(self, x: Any) -> Any:
         return self._series(self._angle_square(x), 0) if isinstance(x, Symbol) else math.cos(x)
 
-    def _body_rate_factors(self, xx: Any, s: Any) -> tuple[Any, ...]:
-        """As `control.body_rate_factors`, without its branch."""
+    def _rate_factors(self, xx: Any, s: Any) -> tuple[Any, ...]:
+        """As `control.rate_factors`, without its branch."""
         self._refuse_wide_angle(xx)
         a, b = self._series(xx, 2), self._series(xx, 3)
         twice = s + s
@@ -270,7 +270,7 @@ class Trace:
             "piece_at": lambda *_: (0, *time(SINCE), 0.0),
             # The step of a table has been replaced by the place of its weights.
             "spline_weights": lambda _, k, __: (0, *time(*range(k, k + 4))),
-            "body_rate_factors": self._body_rate_factors,
+            "rate_factors": self._rate_factors,
             "where_positive": lambda x, a, b: self.symbol("where_positive", x, a, b),
             "is_known_positive": lambda _: False,  # not known
         }

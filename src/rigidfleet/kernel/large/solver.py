@@ -144,7 +144,7 @@ class LargeSolver:
             if not self.pulled:
                 return
             self.counts.fallbacks += 1
-        if not np.isfinite(w.b).all() or not self._solve_in_agent_space():
+        if not np.isfinite(w.b).all() or not self._solve_at_agents():
             self.counts.failures += 1
             self._fill_results_with_nan()
         elif order is not None:
@@ -159,8 +159,8 @@ class LargeSolver:
             self.a[:] = w.f_C
             call_large("multipliers", w.u, order, self.a, w.multiplier)
 
-    def _solve_in_agent_space(self) -> bool:
-        """Iterated Tikhonov in the agents' coordinates, see `constraint.solve_in_agent_space`.
+    def _solve_at_agents(self) -> bool:
+        """Iterated Tikhonov in the agents' coordinates, see `constraint.solve_at_agents`.
 
         The exact law uses the same solve with almost no damping. Its multipliers would be differences of large
         numbers, so they are found from J^T lambda = M a in the same way.
