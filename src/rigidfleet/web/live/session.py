@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.plain import to_json_text
+from rigidfleet._common.plain import to_json_data
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.result import Result
@@ -134,7 +134,7 @@ class Session:
         with self.lock:
             self.pages.add(messages)
             self.left = math.inf
-            messages.put(_stream_event("story", to_json_text(self.page_state())))
+            messages.put(_stream_event("story", json.dumps(to_json_data(self.page_state()))))
         return messages
 
     def remove_page(self, messages: queue.Queue[bytes | None]) -> None:
@@ -258,7 +258,7 @@ class Session:
             news = story | {"phases": len(story["phases"])}
             if news != sent:
                 sent = news
-                self._send_to_pages(_stream_event("story", to_json_text(story)))
+                self._send_to_pages(_stream_event("story", json.dumps(to_json_data(story))))
             due = max(due + TICK / self.speed, now - _LATE)
             self.stopped.wait(max(0.0, due - time.monotonic()))
 
