@@ -411,7 +411,7 @@ def a_sphere(solver: str = "iterated", **tables: Any) -> Mission:
 
 @pytest.mark.parametrize("solver", ["iterated", "exact"])
 def test_forces_of_a_large_formation_are_found_between_steps(solver):
-    """As fine samples about each greatest force tell it, to 1e-5, or 1e-6 of the thrust (2e-6 if solved by iteration)."""
+    """As fine samples about each greatest force tell it, to 1e-5, or 1e-6 of the thrust (2e-6 if iterated)."""
     mission = a_sphere(solver)
     result = simulate(mission)
     (method,) = result.statistics["solvers"]
