@@ -432,3 +432,13 @@ def test_velocities_are_held_to_what_places_are():
     )
     assert loose.statistics["steps"] < 0.85 * strict.statistics["steps"]
     np.testing.assert_allclose(loose.position, best.position, atol=1e-5)
+
+
+def test_large_formations_do_not_creep_into_a_phase(monkeypatch):
+    """Their first step is found from two evaluations: fewer steps, and the same flight."""
+    found = simulate(flight("exact", "henneberg"))
+    monkeypatch.setattr("rigidfleet.simulation.point_phase.first_step", lambda *_: 1e-3)
+    crept = simulate(flight("exact", "henneberg"))
+    assert found.statistics["steps"] <= crept.statistics["steps"] - 2
+    assert found.statistics["rejected"] <= crept.statistics["rejected"]
+    np.testing.assert_allclose(found.position, crept.position, atol=1e-7)

@@ -17,7 +17,7 @@ from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import Command, article_and_kind
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.recording import Unevaluated
-from rigidfleet.simulation.solver_setup import problem_with_solver
+from rigidfleet.simulation.solver_setup import first_step, problem_with_solver
 from rigidfleet.typing import Floats
 
 #: Greatest number of steps, and greatest wall time [s], after which the integrator returns to Python. For any
@@ -59,6 +59,8 @@ class PointPhase(ActivePhase):
         self.steps = _FIRST_STEPS
         if self.external is None:
             self.steps = max(_FIRST_STEPS, _FIRST_NUMBERS // len(y))
+        if self.solver is not None:
+            self.state.clock[records.NEXT_STEP] = first_step(plan, self.workspace, self.state)
 
     def fly(self, problem: Problem, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way."""

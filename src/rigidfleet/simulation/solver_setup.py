@@ -1,16 +1,20 @@
-"""Prepare the integration of a plan: workspace, and solver of large systems."""
+"""Prepare the integration of a plan: workspace, solver of large systems, first step."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidfleet.kernel import records
+from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import RIGID, Problem, Workspace, workspace
 from rigidfleet.planning import solvers
 from rigidfleet.planning.plan import PhasePlan
+from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
     from rigidfleet.kernel.large.solver import LargeSolver, Setup
@@ -64,3 +68,28 @@ def workspace_of(
     return make(
         len(problem.vehicles.m), size, with_h=with_h, solver=problem.law.solver, large=large
     )
+
+
+def first_step(plan: PhasePlan, work: Workspace, state: records.IntegratorState) -> float:
+    """First step [s] to try in a large formation, from two evaluations.
+
+    Hairer, Nørsett and Wanner, Solving Ordinary Differential Equations I, section II.4. Growing from a tiny
+    step would cost a large formation more.
+    """
+    problem: Problem = plan.problem
+    t, y = float(state.clock[records.TIME]), state.y
+    scale = plan.tolerances + state.rtol * np.abs(y)
+
+    def scaled_rms(x: Floats) -> float:
+        return float(np.sqrt(np.mean((x / scale) ** 2)))
+
+    longest = plan.t_end - plan.start
+    slope, later = np.empty_like(y), np.empty_like(y)
+    native.closed_loop(t, y, slope, problem, work)
+    first = scaled_rms(slope)
+    h = min(0.01 * scaled_rms(y) / max(first, 1e-300), longest)
+    native.closed_loop(t + h, y + h * slope, later, problem, work)
+    steepest = max(first, scaled_rms(later - slope) / h)
+    if not 0.0 < steepest < math.inf:
+        return float(state.clock[records.NEXT_STEP])
+    return min(100.0 * h, (0.01 / steepest) ** 0.2, longest)
