@@ -127,8 +127,10 @@ class FindingCollector:
         except ValidationError:
             return None
 
-    def _add_structural_error(self, error: Any, kind: type[Part], prefix: Keys) -> None:
-        """Record one of pydantic's errors."""
+    def _place_of_error(
+        self, error: Any, kind: type[Part], prefix: Keys
+    ) -> tuple[Keys, Any, type[Part]]:
+        """Path of one of pydantic's errors, the value there, and the model that has the key."""
         here, path, owner, inner = look_up(self.data, prefix, {}), prefix, kind, kind
         for step in error["loc"]:
             if isinstance(here, dict) and (step in here or error["type"] == "missing"):
@@ -140,6 +142,11 @@ class FindingCollector:
             else:
                 continue  # pydantic's name of a union member, or an index into a number that stands for all agents
             path = (*path, step)
+        return path, here, owner
+
+    def _add_structural_error(self, error: Any, kind: type[Part], prefix: Keys) -> None:
+        """Record one of pydantic's errors."""
+        path, here, owner = self._place_of_error(error, kind, prefix)
         if error["type"] == "too_short" and len(here) > error["ctx"]["actual_length"]:
             return  # pydantic does not count entries with errors of their own
         if path == ("lqr", "attitude") and error["loc"] != path[1:]:

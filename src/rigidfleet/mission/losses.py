@@ -144,6 +144,15 @@ def phases_under_way(phases: Sequence[AnyPhase], t: float) -> Iterator[tuple[int
             yield k, p
 
 
+def _formations_under_way(phases: Sequence[AnyPhase], t: float) -> list[str | None]:
+    """Formations that may be held at a time [s], each once; None: the places of the start."""
+    held: dict[str | None, None] = {}
+    for k, _ in phases_under_way(phases, t):
+        taken = [p.shaping.formation for p in phases[: k + 1] if p.shaping is not None]
+        held[taken[-1] if taken else None] = None
+    return list(held)
+
+
 def _landing_rules(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
     """Vehicles of a formation that lands reach the ground together."""
     forms, radius, name = m.formations, m.agents.radius, d.landing_formation
@@ -159,11 +168,7 @@ def _landing_rules(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
             remedy = "name a level formation, such as a line or a square"
             yield Breach(where, f"cannot land: {words}", remedy)
         return
-    held: dict[str | None, None] = {}
-    for k, _ in phases_under_way(m.phases, first):
-        taken = [p.shaping.formation for p in m.phases[: k + 1] if p.shaping is not None]
-        held[taken[-1] if taken else None] = None
-    for one in held:
+    for one in _formations_under_way(m.phases, first):
         points = np.array(m.agents.position) if one is None else forms[one].slot_array(n)
         if points is None:
             continue  # distances alone cannot be tracked, which is another finding

@@ -183,6 +183,16 @@ def _motion_time_rules(m: Draft, p: Phase, k: int, longest: float | None) -> Bre
         yield Breach("travel", problem, "reduce travel or end the phase later", lasts)
 
 
+def _count_numbers_of_sample(m: Draft, n: int) -> int:
+    """About how many numbers a sample of n agents has in a result."""
+    about = {"complete": n**2 // 2, "neighbours": 9 * n}
+    edges = sum(
+        about.get(form.edges, 3 * n) if isinstance(form.edges, str) else len(form.edges)
+        for form in m.formations.values()
+    )
+    return 30 * n + 8 * edges + 50
+
+
 def _sample_count_rules(m: Draft, end: float | None) -> Breaches:
     """A result has samples, and not too many."""
     step, n = m.output_step, m.n or 0
@@ -190,12 +200,7 @@ def _sample_count_rules(m: Draft, end: float | None) -> Breaches:
         return
     switches = 2 * len(m.tables("phases"))  # one sample per step, and two at each change of phase
     samples = end / step + switches
-    about = {"complete": n**2 // 2, "neighbours": 9 * n}
-    edges = sum(
-        about.get(form.edges, 3 * n) if isinstance(form.edges, str) else len(form.edges)
-        for form in m.formations.values()
-    )
-    numbers = 30 * n + 8 * edges + 50
+    numbers = _count_numbers_of_sample(m, n)
     if step > end:
         problem, remedy = f"is longer than the mission, which ends at {end:g} s", "reduce it"
     elif end / step > _MOST_SAMPLES:
