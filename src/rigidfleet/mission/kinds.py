@@ -121,8 +121,8 @@ class AnyPhase(Part):
 
     @property
     def turns_away(self) -> bool:
-        """Whether the phase ends in an attitude that no key commands: turned by its file or its orbit."""
-        return self.__dict__.get("yaw") in ("file", "along")
+        """Whether the phase ends in an attitude that no key commands."""
+        return False
 
     @property
     def rest_position(self) -> values.Vector | None:
@@ -547,6 +547,11 @@ class Follow(Cruising):
         return stack_ways([rows_to_curve(rows) for rows in self.trajectories or ()], _COEFFICIENTS)
 
     @property
+    def turns_away(self) -> bool:
+        """Whether the body turns as the file says."""
+        return self.yaw == "file"
+
+    @property
     def leads_to(self) -> str:
         """The trajectories."""
         n = len(self.trajectories or ())
@@ -586,6 +591,11 @@ class Orbit(Cruising):
         "the limits",
         4.0,
     )
+
+    @property
+    def turns_away(self) -> bool:
+        """Whether the body turns with the orbit."""
+        return self.yaw == "along"
 
     @property
     def leads_to(self) -> str:
