@@ -14,7 +14,18 @@ import re
 import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from inspect import signature
+from types import NoneType, UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +53,7 @@ class Array:
 
 
 def read_attribute(file: h5py.File, name: str, kind: Any) -> Any:
-    """Return an attribute as ``int`` or ``str``, or the JSON in it as any other type, as pydantic reads it.
+    """Return an attribute as ``int`` or ``str``, or the JSON in it as any other type (`of_type`).
 
     Raises
     ------
@@ -63,25 +74,73 @@ def read_attribute(file: h5py.File, name: str, kind: Any) -> Any:
         value = value.decode("utf-8", "surrogateescape")
     if not isinstance(value, str):
         raise DamagedError(f"attribute {name} is not text")
-    if re.search("[\ud800-\udfff]", value):  # a lone surrogate
+    if not _is_text(value):
         raise DamagedError(f"attribute {name} is not UTF-8 text")
     if kind is str:
         return value
-    from pydantic import TypeAdapter, ValidationError
-
     try:
-        TypeAdapter(kind).validate_json(value)
-    except ValidationError as error:
-        wrong = error.errors(include_url=False)[0]
-        if wrong["type"] == "json_invalid":
-            why = wrong["ctx"]["error"]
-            raise DamagedError(f"attribute {name} is not valid JSON ({why})") from None
-        steps = (f"[{at + 1}]" if isinstance(at, int) else f".{at}" for at in wrong["loc"])
-        shown = reprlib.repr(wrong["input"])[:60]
-        raise DamagedError(
-            f"attribute {name}{''.join(steps)} has an invalid value: {shown}"
-        ) from None
-    return json.loads(value)
+        plain = json.loads(value)
+    except (ValueError, RecursionError) as error:
+        raise DamagedError(f"attribute {name} is not valid JSON ({error})") from None
+    return of_type(plain, kind, f"attribute {name}")
+
+
+def of_type(value: Any, kind: Any, where: str) -> Any:
+    """Check plain data against a type and return it.
+
+    Types are dataclasses, typed dictionaries, lists, tuples, literals, text, integers and finite numbers. A dataclass
+    is constructed; a tuple stays a list. Unknown keys and values of another type are errors, except that a typed
+    dictionary with the key ``__others__`` admits any key. ``Annotated[A, B]`` is checked as B, or may be None.
+
+    Raises
+    ------
+    DamagedError
+        The data do not match. The message begins with ``where``.
+    """
+    origin, inner = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return value
+    if origin is Annotated:  # A is the type in Python, B the type in a file
+        return None if value is None else of_type(value, inner[1], where)
+    if origin in (Union, UnionType):  # every union here is `X | None`
+        some = next(k for k in inner if k is not NoneType)
+        return None if value is None else of_type(value, some, where)
+    if origin is Literal and isinstance(value, str) and value in inner:
+        return value
+    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        if abs(value) <= _HUGE:
+            return float(value)
+    elif kind in (str, int, bool) and type(value) is kind:
+        if kind is not str or _is_text(value):
+            return value
+    elif origin is list and isinstance(value, list):
+        return [of_type(item, inner[0], f"{where}[{k + 1}]") for k, item in enumerate(value)]
+    elif origin is tuple and isinstance(value, list) and len(value) == len(inner):
+        return [of_type(item, k, where) for item, k in zip(value, inner, strict=True)]
+    elif isinstance(value, dict):
+        if origin is dict:
+            return {key: of_type(item, inner[1], f"{where}.{key}") for key, item in value.items()}
+        hints = get_type_hints(kind, include_extras=True)
+        needed = getattr(kind, "__required_keys__", None)
+        if needed is None:  # a dataclass
+            parameters = signature(kind).parameters.values()
+            needed = {x.name for x in parameters if x.default is x.empty}
+        known = hints.keys() - {"__others__"}
+        if needed <= value.keys() and ("__others__" in hints or value.keys() <= known):
+            made = {
+                key: of_type(item, hints.get(key, Any), f"{where}.{key}")
+                for key, item in value.items()
+            }
+            return kind(**made)
+    raise DamagedError(f"{where} has an invalid value: {reprlib.repr(value)[:60]}")
+
+
+#: Maximum magnitude of a number.
+_HUGE = 1e300
+
+
+def _is_text(value: str) -> bool:
+    return re.search("[\ud800-\udfff]", value) is None  # a lone surrogate
 
 
 def read_arrays(

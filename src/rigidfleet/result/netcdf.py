@@ -8,9 +8,8 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from rigidfleet._common.files import os_error_in_words
 from rigidfleet._common.plain import to_json_text
 from rigidfleet.errors import ResultError, refuse_format
-from rigidfleet.result.phases import EXACT, PhaseRecord
+from rigidfleet.result.phases import PhaseRecord
 
 #: Version of the file format. Files of any other version are rejected.
 SCHEMA_VERSION = 4
@@ -46,21 +45,19 @@ LABELS: dict[str, tuple[str, ...]] = {
 }
 
 
-@dataclass
-class Statistics:
+class Statistics(TypedDict, total=False):
     """Statistics of the integrator. Other keys are allowed."""
 
-    __pydantic_config__: ClassVar = EXACT | {"extra": "allow"}
-
-    evaluations: int = 0
-    steps: int = 0
-    rejected: int = 0
-    wall_s: float = 0.0
-    simulated_s: float = 0.0
-    rtol: float = 0.0
-    atol: float = 0.0
-    solvers: dict[str, dict[str, float]] = field(default_factory=dict)
-    spans: list[tuple[float, float]] = field(default_factory=list)
+    __others__: Any
+    evaluations: int
+    steps: int
+    rejected: int
+    wall_s: float
+    simulated_s: float
+    rtol: float
+    atol: float
+    solvers: dict[str, dict[str, float]]
+    spans: list[tuple[float, float]]
 
 
 #: Attributes of a file and their types. Types other than int and str are stored as JSON.
@@ -165,8 +162,7 @@ def read_netcdf(path: Path, variables: Mapping[str, Variable]) -> dict[str, Any]
         }
         sizes = {dim: len(names) for dim, names in LABELS.items()}
         arrays = reader.read_arrays(file, due, sizes, len(data))
-    phases = [PhaseRecord(**phase) for phase in attributes["phases"]]
-    return arrays | attributes | {"complete": bool(attributes["complete"]), "phases": phases}
+    return arrays | attributes | {"complete": bool(attributes["complete"])}
 
 
 def _netcdf_attribute_name(name: str) -> str:

@@ -3,58 +3,47 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
-
-#: How pydantic reads what a file has: without conversions, and without keys that are not declared.
-EXACT: dict[str, Any] = {"strict": True, "allow_inf_nan": False, "extra": "forbid"}
+from typing import Annotated, Any, Literal, NamedTuple, TypedDict
 
 _Three = tuple[float, float, float]
 
 
-@dataclass
-class Passed:
+class _Moment(TypedDict):
+    time: float
+
+
+class _Place(_Moment):
+    position: _Three
+
+
+class Passed(_Place, total=False):
     """A point that the centre of mass is to pass, when, and at which velocity if that is commanded."""
 
-    time: float
-    position: _Three
-    velocity: _Three | None = None
+    velocity: _Three
 
 
-@dataclass
-class Target:
+class Target(_Moment, total=False):
     """Target of a phase: time of arrival [s] and the state commanded then, and points to pass on the way.
 
     None: nothing is commanded.
     """
 
-    time: float
-    position: _Three | None = None
-    velocity: _Three | None = None
-    attitude: tuple[float, float, float, float] | None = None
-    rates: _Three | None = None
-    through: list[Passed] = field(default_factory=list)
+    position: _Three | None
+    velocity: _Three | None
+    attitude: tuple[float, float, float, float] | None
+    rates: _Three | None
+    through: list[Passed]
 
 
-@dataclass
-class Planned:
+class Planned(_Moment):
     """Certificate of a phase: the least separation of the planned paths [m], its time [s], the two agents, the proof.
 
     Agents are counted from 0. ``how`` is "closed form" or "conservative advancement".
     """
 
-    time: float
     separation: float
     agents: tuple[int, int]
     how: str
-
-
-class Stored(NamedTuple):
-    """What a file has in place of the type of an entry."""
-
-    kind: Any
-
-    def __get_pydantic_core_schema__(self, _source: Any, handler: Any) -> Any:
-        return handler(self.kind)
 
 
 #: A vehicle that stays within this distance of an obstacle below it from the start, or until the end, stands on it [m].
@@ -111,8 +100,6 @@ class PhaseRecord:
     controller : whether a user's controller was called; None if the flight had none
     """
 
-    __pydantic_config__: ClassVar = EXACT
-
     name: str
     kind: str
     control: Literal["open", "tracking", "body"]
@@ -120,12 +107,14 @@ class PhaseRecord:
     t_start: float
     t_end: float
     settled: bool | None = None
-    target: Annotated[dict[str, Any] | None, Stored(Target | None)] = None
-    planned: Annotated[dict[str, Any] | None, Stored(Planned | None)] = None
-    extremes: dict[str, Extremum] = field(default_factory=dict)
+    target: Annotated[dict[str, Any] | None, Target] = None
+    planned: Annotated[dict[str, Any] | None, Planned] = None
+    extremes: Annotated[dict[str, Extremum], dict[str, tuple[float, float, int, int]]] = field(
+        default_factory=dict
+    )
     abandoned: bool = False
     controller: bool | None = None
-    stay: Annotated[dict[str, Any] | None, Stored(Target | None)] = None
+    stay: Annotated[dict[str, Any] | None, Target] = None
 
     def __post_init__(self) -> None:
         self.extremes = {name: Extremum(*x) for name, x in (self.extremes or {}).items()}
