@@ -48,7 +48,7 @@ robustness: .venv/.core  ## Fly 200 random formations under every graph and law
 network: .venv/.core  ## Fly formations over networks that lose and delay (half an hour)
 	@$(BIN)/python benchmarks/network.py --write docs/network.md
 
-day: .venv/.oracles .venv/.interchange .venv/.dev  ## Rehearse and abort shows of a thousand, against oracles (an hour)
+day: .venv/.oracles .venv/.interchange .venv/.dev  ## Rehearse and abort shows of a thousand, against oracles (six minutes)
 	@$(BIN)/python benchmarks/day.py --write docs/day.md
 
 evening: .venv/.core  ## Judge logs of which the truth is known (half an hour)

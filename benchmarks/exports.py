@@ -23,7 +23,7 @@ def row(result: rf.Result, name: str, folder: Path, flown: bool) -> str:
     """Deviation [mm] and [deg] and kilobytes of an export, or why there is none."""
     path = folder / (f"{name}.csv" if name == "setpoints" else name)
     try:
-        made = export(result, path, name, flown=flown)  # ty: ignore[invalid-argument-type]
+        made = export(result, path, name, flown=flown)
     except ResultError as error:
         found = re.search(r"is ([\d.]+ m) from|needs (\d+ \w+) of|needs (\d+ bytes)", str(error))
         return f"refused: {next(x for x in found.groups() if x) if found else error}"

@@ -383,7 +383,7 @@ def main() -> int:
     rows = [(measured(k, n), goal) for k, n, goal in flights]
     console.print(table(rows))
     for method in dict.fromkeys(row.solve for row, _ in rows):
-        console.print(f"{method}: {WORDS.get(method, method)}", highlight=False)  # ty: ignore
+        console.print(f"{method}: {WORDS.get(method, method)}", highlight=False)
     exponent, exponents, spent = growth(rows), judging(), show()
     judged = goals(rows, exponent, exponents, spent)
     for goal in judged:

@@ -175,8 +175,9 @@ def in_kernel(job: Callable[[], object], at_least: float) -> tuple[float, float]
     """Time [s] of one call, as `seconds`, and what of it is spent in the kernel's integrator and monitor."""
     inside = 0.0
     watch = native.Watch
-    parts = (native.Integration, "__call__"), (watch, "distances"), (watch, "forces")
-    whole = [(kind, name, getattr(kind, name)) for kind, name in parts]
+    parts = (watch, watch.search_distances), (watch, watch.search_forces)
+    whole = [(native.Integration, "__call__", native.Integration.__call__)]
+    whole += [(kind, call.__name__, call) for kind, call in parts]
 
     def timed(call: Callable[..., int]) -> Callable[..., int]:
         def of(*arguments: object, **options: object) -> int:

@@ -68,21 +68,23 @@ class Film:
         self._still()
         look: dict[str, Any] = {"zorder": 20}
         self.trails = [self.whole.plot([], [], color=c, lw=1.5, **look)[0] for c in self.colours]
-        self.shape = self.whole.add_collection(LineCollection([], colors=INK, lw=1.0, zorder=21))
+        self.shape: Any = self.whole.add_collection(
+            LineCollection([], colors=INK, lw=1.0, zorder=21)
+        )
         self.dots = self.whole.scatter([], [], s=22, zorder=22, linewidths=0)
-        self.walls = [
+        self.walls: list[Any] = [
             self.near.add_patch(Rectangle((0, 0), 0, 0, facecolor=SIDE, edgecolor=GREY, lw=0.8))
             for _ in self.boxes
         ]
-        self.edges = self.near.add_collection(LineCollection([], colors=INK, lw=1.6, zorder=5))
+        self.edges: Any = self.near.add_collection(LineCollection([], colors=INK, lw=1.6, zorder=5))
         self.ways = [
             self.near.plot([], [], color=mixed(c, FADED[1]), lw=1.4)[0] for c in self.colours
         ]
-        self.bodies = [
+        self.bodies: list[list[Any]] = [
             [self.near.add_patch(Circle((0, 0), 0.26, color=c, zorder=6)) for _ in range(4)]
             for c in self.colours
         ]
-        self.arms = self.near.add_collection(LineCollection([], colors=INK, lw=1.6, zorder=7))
+        self.arms: Any = self.near.add_collection(LineCollection([], colors=INK, lw=1.6, zorder=7))
         self.clock = self.figure.text(0.975, 0.93, "", ha="right", fontsize=11, color=GREY)
         self.words = self.figure.text(0.617, 0.86, "", fontsize=13, weight="bold", color=INK)
 
@@ -130,7 +132,7 @@ class Film:
         self.shape.set_segments(list(flat[held]))
         self.shape.set_color(GREY if faint.any() else INK)
         self.dots.set_offsets(flat)
-        self.dots.set_facecolors(
+        self.dots.set_facecolor(
             [mixed(c, FADED[1] if f else 1.0) for c, f in zip(self.colours, faint, strict=True)]
         )
         self.near.set(

@@ -13,6 +13,7 @@ tables stay as they are. No number of theirs is written by hand.
 import json
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -58,7 +59,7 @@ def _ratios(name: str, theirs: str) -> Any:
             for row in data[name]
             if "share" not in row["name"]  # of a time of ours, not of a peer's
         ]
-        return _table_symbols(("", "ours [ms]", f"{theirs} [ms]", "ratio", "rounds", "goal"), rows)
+        return _markdown(("", "ours [ms]", f"{theirs} [ms]", "ratio", "rounds", "goal"), rows)
 
     return write
 
@@ -77,7 +78,7 @@ def _missions(data: Data) -> str:
         f"{median(flown['ratios']):,.0f}",
         f"≥ {flown['goal']:,.0f}",
     )
-    table = _table_symbols(("", "ours [ms]", "simulated s in a second", "goal"), [row])
+    table = _markdown(("", "ours [ms]", "simulated s in a second", "goal"), [row])
     judged = [
         f"{other['name'].strip()}: {_time(other['ours'])} ms"
         + (f" (goal: {1e3 * other['theirs'][0]:,.0f} ms)." if other["goal"] else ".")
@@ -108,7 +109,7 @@ def _operations(data: Data) -> str:
             rows.append(("as straight-line code", *(f"{n:,}" for n in straight)))
         rows.append((f"{title}: ns an evaluation", *(f"{1e9 * s:,.0f}" for s in each)))
         rows.append(("share of the bound", *(f"{100 * n / s / bound:.2g} %" for n, s in shares)))
-    text = _table_symbols(("", *(f"{n} agents" for n in counts)), rows)
+    text = _markdown(("", *(f"{n} agents" for n in counts)), rows)
     return f"{text}\n\nThe bound: {1e-9 * data['bound']:.3g} Gflop/s on {data['cores']} cores."
 
 
@@ -129,7 +130,7 @@ def _peers(data: Data) -> str:
         for row in data["rows"]
     ]
     head = ("agents", "", "setting", "simulated s in a second", "time / ours", "rounds")
-    text = _table_symbols((*head, "error [m]", "from ours [m]", "distances [m]"), rows)
+    text = _markdown((*head, "error [m]", "from ours [m]", "distances [m]"), rows)
     absent = "".join(f"\n\nAbsent: {name}." for name in data["absent"])
     return f"{text}\n\nMeasured on {data['date']}: {data['machine']}.{absent}"
 
@@ -149,7 +150,7 @@ def _summary(data: Data) -> str:
         (text, *(f"{float(f'{rates[peer, n]:.2g}'):,.10g}" for n in agents))
         for peer, text in names.items()
     ]
-    text = _table_symbols(("", *(f"{n} agents" for n in agents)), rows)
+    text = _markdown(("", *(f"{n} agents" for n in agents)), rows)
     return f"{text}\n\nMeasured on {data['date']}: {data['machine']}."
 
 
@@ -190,9 +191,9 @@ def _many(data: Data) -> str:
         )
         for goal in found["goals"]
     ]
-    judged = _table_symbols(("", "goal", "measured", "reached"), goals)
+    judged = _markdown(("", "goal", "measured", "reached"), goals)
     load = f"Other programs' load when it began: {found['load']:.1f}."
-    return f"{_table_symbols(head, rows)}\n\n{judged}\n\n{_machine(found)} {load}"
+    return f"{_markdown(head, rows)}\n\n{judged}\n\n{_machine(found)} {load}"
 
 
 def _graphs(data: Data) -> str:
@@ -209,7 +210,7 @@ def _graphs(data: Data) -> str:
         for row in data["many"]["graphs"]
     ]
     head = ("shape", "edges", "how many", "longest [2 m]", "index", "condition of $A$")
-    return _table_symbols(head, rows)
+    return _markdown(head, rows)
 
 
 def _vehicles(data: Data) -> str:
@@ -236,8 +237,8 @@ def _vehicles(data: Data) -> str:
         for row in found["rates"]
     ]
     head = ("90 s of flight", "step [ms]", "error [m]", "times real time", "rounds", "goal")
-    text = _table_symbols(head, flights)
-    hover = _table_symbols(("hover", "vehicles", "step [ms]", "vehicle-steps in a second"), rates)
+    text = _markdown(head, flights)
+    hover = _markdown(("hover", "vehicles", "step [ms]", "vehicle-steps in a second"), rates)
     return f"{text}\n\n{hover}\n\nMeasured on {found['date']}: {found['machine']}; rigidfleet {found['version']}."
 
 
@@ -246,7 +247,7 @@ def _time(seconds: list[float]) -> str:
     return f"{value:.3g}" if value < 1000 else f"{value:,.0f}"
 
 
-def _table_symbols(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+def _markdown(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     rule = ("---", *("--:" for _ in head[1:]))
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, rule, *rows))
 

@@ -156,7 +156,7 @@ def drawings() -> None:
         buffer = io.StringIO()
         with apply_style(), matplotlib.rc_context({"svg.fonttype": "path"}):
             draw().savefig(buffer, format="svg", metadata={"Date": None})
-        name = draw.__name__.replace("_", "-")
+        name = draw.__name__.replace("_", "-")  # ty: ignore[missing-attribute]
         # Lines without blanks at their ends, as in any text that is kept.
         lines = (line.rstrip() for line in buffer.getvalue().splitlines())
         keep_or_write(IMAGES / f"{name}.svg", ("\n".join(lines) + "\n").encode())

@@ -8,6 +8,7 @@ which B lacks; `shapes`, `missions`, `result`, `metrics` and `margins` what thei
 import json
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,7 @@ def _keys(schema: dict[str, Any], name: str) -> str:
         for key, entry in part["properties"].items()
         if key not in left_out
     ]
-    return _table_symbols(("key", "value", "default", "meaning"), rows)
+    return _markdown(("key", "value", "default", "meaning"), rows)
 
 
 def _is_table(entry: dict[str, Any]) -> bool:
@@ -149,7 +150,7 @@ def _quoted(value: Any) -> str:
 def _shapes() -> str:
     """The named shapes: name, agents, slots."""
     rows = [(f"`{name}`", agents_taken(name), shape.text) for name, shape in SHAPES.items()]
-    return _table_symbols(("shape", "agents", "slots"), rows)
+    return _markdown(("shape", "agents", "slots"), rows)
 
 
 def _missions() -> str:
@@ -160,7 +161,7 @@ def _missions() -> str:
         for name in names:
             mission = load_mission(name)
             rows.append((f"`{name}`", mission.title, mission.source))
-    return _table_symbols(("mission", "what it shows", "in the paper"), rows)
+    return _markdown(("mission", "what it shows", "in the paper"), rows)
 
 
 def _result() -> str:
@@ -170,7 +171,7 @@ def _result() -> str:
         for name, v in VARIABLES.items()
     ]
     along = "; ".join(f"`{dim}`: {', '.join(names)}" for dim, names in LABELS.items())
-    return f"{_table_symbols(('variable', 'dimensions', 'unit', 'meaning'), rows)}\n\n{along}."
+    return f"{_markdown(('variable', 'dimensions', 'unit', 'meaning'), rows)}\n\n{along}."
 
 
 def _bounds() -> str:
@@ -196,7 +197,7 @@ def _bounds() -> str:
         ("heights of a height map", f"{bounds.HEIGHTS:,}"),
         ("the heaviest vehicle over the lightest", f"{bounds.MASS_RATIO:g}"),
     ]
-    return _table_symbols(("what", "at most"), rows)
+    return _markdown(("what", "at most"), rows)
 
 
 def _magnitudes() -> str:
@@ -206,13 +207,13 @@ def _magnitudes() -> str:
         for name, b in vars(bounds).items()
         if isinstance(b, bounds.Bound)
     ]
-    return _table_symbols(("quantity", "least, where it must be > 0", "most", "unit"), rows)
+    return _markdown(("quantity", "least, where it must be > 0", "most", "unit"), rows)
 
 
 def _metrics() -> str:
     """The metrics of a sweep: name, unit, meaning."""
     rows = [(f"`{name}`", m.unit, m.text.replace("|", "\\|")) for name, m in METRICS.items()]
-    return _table_symbols(("metric", "unit", "meaning"), rows)
+    return _markdown(("metric", "unit", "meaning"), rows)
 
 
 def _drill() -> str:
@@ -223,7 +224,7 @@ def _drill() -> str:
         for default in [field.default]
         for magnitudes in [default if isinstance(default, tuple) else (default,)]
     ]
-    return _table_symbols(("key", "default", "meaning"), rows)
+    return _markdown(("key", "default", "meaning"), rows)
 
 
 #: Attitude gains [1/s^2, 1/s] and time constant of the rotors [s]; docs/vehicles.md names the sources.
@@ -264,10 +265,10 @@ def _margins() -> str:
         "vehicle", "delay [ms]", "largest p [1/s]", "8/(9τ)", "constraint law at p = 2",
         "tracking", "its gains, times up to",
     )  # fmt: skip
-    return _table_symbols(head, rows)
+    return _markdown(head, rows)
 
 
-def _table_symbols(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+def _markdown(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     lines = [head, ("---",) * len(head), *rows]
     return "\n".join(f"| {' | '.join(row)} |" for row in lines)
 

@@ -55,7 +55,7 @@ def _own() -> np.ndarray:
     return LOOP[:, None] + near[:, None, None] * np.einsum("kab,nb->kna", R, np.array(SLOTS))
 
 
-def _table_symbols(position: np.ndarray, agents: bool = True) -> str:
+def _csv_text(position: np.ndarray, agents: bool = True) -> str:
     rows = ["time_s," + "agent," * agents + "x_m,y_m,z_m"]
     for t, places in zip(TIME, position, strict=True):
         for i, place in enumerate(places.tolist(), start=1):
@@ -128,12 +128,12 @@ def test_each_vehicle_follows_its_own(tmp_path, folder):
             _written(
                 tmp_path,
                 'file = "ways"',
-                content=_table_symbols(own[:, i - 1 : i], False),
+                content=_csv_text(own[:, i - 1 : i], False),
                 file=f"ways/{i}.csv",
             )
         path = tmp_path / "mission.toml"
     else:
-        path = _written(tmp_path, 'file = "way.csv"', content=_table_symbols(own))
+        path = _written(tmp_path, 'file = "way.csv"', content=_csv_text(own))
     result = rf.simulate(path)
     assert rf.assess(result).passed
     for k in (60, 72, 120):
@@ -194,7 +194,7 @@ BAD = {
     "nan": (_loop().replace("0.5000,", "0.5000,nan,", 1).replace("nan,", "nan,", 1), "line"),
     "order": (_loop().replace("0.5000,", "0.3000,", 1), "line 7"),
     "columns": ("a,b,c\n1,2,3\n2,3,4\n", "has no names of columns"),
-    "two vehicles": (_table_symbols(_own()[:, :2]), "has 2 trajectories for 3 agents"),
+    "two vehicles": (_csv_text(_own()[:, :2]), "has 2 trajectories for 3 agents"),
     "jump": (
         "duration," + ",".join(f"{c}^{k}" for c in ("x", "y", "z", "yaw") for k in range(8)) + "\n"
         + "1," + ",".join(["0"] * 16 + ["10"] + ["0"] * 15) + "\n"
@@ -209,7 +209,7 @@ def test_vehicles_follow_what_was_exported(tmp_path, kind, near):
     """A flight that leaves as a show or as ROS 2 poses is followed as it was flown, within the format's deviation."""
     if kind == "mcap":
         pytest.importorskip("mcap", reason="make .venv/.interchange installs it")
-    first = rf.simulate(_written(tmp_path, 'file = "way.csv"', content=_table_symbols(_own())))
+    first = rf.simulate(_written(tmp_path, 'file = "way.csv"', content=_csv_text(_own())))
     file = f"flown.{kind}"
     rf.export(first, tmp_path / file, kind)
     path = tmp_path / "again.toml"

@@ -61,7 +61,7 @@ class Watched:
         self.monitor = self.watch.monitor
 
     def take(self) -> "Watched":
-        self.watch.distances(self.problem, self.state, 0, len(self.state.trail.clock))
+        self.watch.search_distances(self.problem, self.state, 0, len(self.state.trail.clock))
         return self
 
     def worst(self, kind: int) -> tuple[float, float, list[int]]:

@@ -170,7 +170,7 @@ class CurveWatch:
                 part = state.trail.clock[row], state.trail.points[row]
                 self._watch_step(problem, work, state, *part)
             return
-        self.monitor.distances(problem, state, first, steps)
+        self.monitor.search_distances(problem, state, first, steps)
         self._find_contacts(problem, work, state, np.arange(first, steps))
 
     def _find_contacts(
@@ -207,7 +207,7 @@ class CurveWatch:
         self.worst[kind] = -_TOUCH
         arrays[-1][:] = 0
         self._monitor_clearances(problem, state, 0, len(steps[0]))
-        self.monitor.distances(problem, state, 0, len(steps[0]))
+        self.monitor.search_distances(problem, state, 0, len(steps[0]))
         contact = self._extremum(kind) if self.worst[kind] < -_TOUCH else None
         for array, own in zip(arrays, before, strict=True):
             array[...] = own
@@ -306,7 +306,7 @@ class CurveWatch:
                     self._watch_step(problem, work, state, *(x[None] for x in half))
                 return
         self.moved += moved
-        self.monitor.distances(problem, alone, 0, 1)
+        self.monitor.search_distances(problem, alone, 0, 1)
         self._find_contacts(problem, work, alone, np.zeros(1, dtype=np.int64))
 
     def _list_near_pairs(self, problem: Problem, y: Floats, moves: float) -> None:

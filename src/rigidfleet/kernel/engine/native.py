@@ -121,7 +121,9 @@ class Watch:
         """Bound how far distances change over the first step, into ``monitor.moves``."""
         library().bound_moves(pack(problem).address, pack(state).address, self.address)
 
-    def distances(self, problem: Problem, state: IntegratorState, first: int, end: int) -> None:
+    def search_distances(
+        self, problem: Problem, state: IntegratorState, first: int, end: int
+    ) -> None:
         """Search the steps from ``first`` to before ``end`` for extremes of distances and speeds."""
         of = pack(problem).address, pack(state).address, self.address
         library().watch_distances(first, end, *of)
