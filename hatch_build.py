@@ -69,7 +69,7 @@ class MachineCode(BuildHookInterface):
             if None in made.values():
                 raise OSError("the kernel does not compile here")
             for level in LEVELS:
-                target = objects.shared_object_path(level, sources_digest())
+                target = objects.shipped_object_path(level, sources_digest())
                 codes = [code for part in objects.ENTRIES for code in made[level, part]]
                 include[link(codes, folder / target.name)] = str(target.relative_to(package.parent))
         except (OSError, subprocess.CalledProcessError) as error:

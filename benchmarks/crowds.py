@@ -85,7 +85,7 @@ def kernel(n: int, **given: Any) -> tuple[Any, ...]:
     vehicles = fleet.quadrotor_arrays(
         [fleet.VehicleDynamics(1.0, point=True, limit=THRUST)] * n, 0.0
     )
-    flight = fleet.ideal_flight(vehicles, start=0.0, h=PERIOD, steps=1)
+    flight = fleet.new_ideal_flight(vehicles, start=0.0, h=PERIOD, steps=1)
     work = workspace(n, 0)
     state = fleet.initial_state(flight, np.zeros((n, fleet.STATES)), work)
     given = {"radius": 0.5 * APART} | given

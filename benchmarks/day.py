@@ -62,7 +62,7 @@ def took(clock: float, busy: float) -> str:
     return f"{clock:.0f} s ({busy:.0f} s)"
 
 
-def mission_file(folder: Path, name: str, **tables: Any) -> str:
+def with_toml_suffix(folder: Path, name: str, **tables: Any) -> str:
     """A shipped mission with other tables, as a file."""
     path = folder / f"{name}.toml"
     path.write_text(to_toml(rf.load_mission(name).to_dict() | tables), encoding="utf-8")
@@ -84,7 +84,7 @@ def areas(folder: Path) -> Iterator[Line]:
         {"disturbances": more["disturbances"]},
         more,
     ):  # the first may have to compile
-        file = mission_file(folder, SHOW, **tables)
+        file = with_toml_suffix(folder, SHOW, **tables)
         busy.append(ran("run", file, "--no-figures", "--force", "--out", str(folder / "areas"))[2])
     yield Line(
         f"fence, people and falls in flight and verdict of {SHOW}", "",
@@ -137,7 +137,7 @@ def aborts(folder: Path) -> Iterator[Line]:
         ("any", "any place", 60.0, 1.0),
         ("own", "own pads", 300.0, 0.9),
     ):
-        file = mission_file(folder, SHOW, abort={"to": to})
+        file = with_toml_suffix(folder, SHOW, abort={"to": to})
         text, *times = ran("check", file, "--abort", "--json")
         every = json.loads(text)["aborts"]
         ways = [x for x in every if x["way"]]

@@ -80,7 +80,7 @@ def passage(h: float) -> tuple[float, float, np.ndarray]:
     agents, state, spent, path = mission.agents, None, 0.0, []
     now = PhaseState(0.0, np.array(agents.position), np.array(agents.velocity))
     vehicles = fleet.quadrotor_arrays([VEHICLE] * len(now.r), G)
-    flight = fleet.ideal_flight(vehicles, start=0.0, h=h, steps=round(1.0 / (RATE * h)))
+    flight = fleet.new_ideal_flight(vehicles, start=0.0, h=h, steps=round(1.0 / (RATE * h)))
     S = fleet.hover_states(vehicles, now.r, now.v)
     for phase in mission.phases:
         plan = plan_phase(mission, leg_of(mission, phase, now))
@@ -122,7 +122,7 @@ def rotorpy(steps: int) -> float:
     rest = {name: np.zeros(3) for name in ("x", "x_dot", "x_ddot")} | {"yaw": 0.0, "yaw_dot": 0.0}
     state = {
         "x": np.zeros(3), "v": np.zeros(3), "q": np.array([0.0, 0, 0, 1]), "w": np.zeros(3), "wind": np.zeros(3),
-        "rotor_speeds": np.full(4, VEHICLE.speed_at(VEHICLE.m * G / 4)),
+        "rotor_speeds": np.full(4, VEHICLE.rotor_speed_at(VEHICLE.m * G / 4)),
     }  # fmt: skip
     start = time.process_time()
     for k in range(steps):

@@ -466,7 +466,7 @@ def fly_with(plain: str) -> None:
         monitor.bound_distance_changes(problem, state, watch.monitor)
 
     def distances(watch: Any, problem: Any, state: Any, first: int, end: int) -> None:
-        monitor.watch_distances(first, end, problem, state, watch.monitor)
+        monitor.watch_trail_distances(first, end, problem, state, watch.monitor)
 
     def search_clearances(
         watch: Any, problem: Any, state: Any, first: int, end: int, s: Any

@@ -198,7 +198,7 @@ def test_barriers_change_accelerations_as_exact_solvers_do(seed, solve):
     u = r[edges[:, 0]] - r[edges[:, 1]]
     work.u[:] = u / np.linalg.norm(u, axis=1, keepdims=True)
     points = [fleet.VehicleDynamics(x, point=True) for x in m]
-    flight = fleet.ideal_flight(fleet.quadrotor_arrays(points, 0.0), start=0.0, h=0.02, steps=1)
+    flight = fleet.new_ideal_flight(fleet.quadrotor_arrays(points, 0.0), start=0.0, h=0.02, steps=1)
     state = fleet.initial_state(flight, np.zeros((n, fleet.STATES)), work)
     a = avoidance_arrays(
         period=0.02, b=b, lift=np.full(n, 1e3), mass=m, g=0.0, radius=np.full(n, D / 2), rate=rate, share=share,

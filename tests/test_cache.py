@@ -19,7 +19,7 @@ import pytest
 from rigidfleet.kernel.compiler import cache, jit
 from rigidfleet.kernel.compiler.cache import cache_directory
 from rigidfleet.kernel.engine import native, objects
-from rigidfleet.kernel.engine.native import is_compiled
+from rigidfleet.kernel.engine.native import has_machine_code
 
 PLANTED, OWN = 666, 1
 SOMEONE = 12345
@@ -77,7 +77,7 @@ def planted(base: Path) -> Path:
 
 def test_what_this_user_wrote_is_run(base):
     """Machine code in folders that this user alone can write is loaded, and nothing is compiled."""
-    assert is_compiled()
+    assert has_machine_code()
     assert answer() == PLANTED
 
 
@@ -88,7 +88,7 @@ def test_a_folder_that_others_can_write(which, right, base):
     and how to keep what was compiled."""
     folder = {"outer": base / "rigidfleet", "inner": place(base)}[which]
     folder.chmod(right)
-    assert not is_compiled()
+    assert not has_machine_code()
     with pytest.warns(RuntimeWarning) as warned:
         assert answer() == OWN
     (only,) = warned
@@ -105,7 +105,7 @@ def test_what_belongs_to_others(which, base):
     """Machine code that belongs to another user, or lies in their folder, is not run."""
     chosen = {"outer": base / "rigidfleet", "inner": place(base), "file": planted(base)}[which]
     os.chown(chosen, SOMEONE, -1)
-    assert not is_compiled()
+    assert not has_machine_code()
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         assert answer() == OWN
@@ -136,7 +136,7 @@ def test_what_is_no_file(kind, base, tmp_path):
         os.mkfifo(file)
     else:
         file.mkdir()
-    assert not is_compiled()
+    assert not has_machine_code()
     with pytest.warns(RuntimeWarning) if kind == "folder" else warnings.catch_warnings():
         assert answer() == OWN
 

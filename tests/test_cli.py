@@ -677,7 +677,9 @@ def test_first_compile(capsys, monkeypatch):
     """A first compile says on standard error that it compiles, and a later flight does not."""
     words = "Compiling the simulator"
     for compiled in (False, True):
-        monkeypatch.setattr("rigidfleet.kernel.engine.native.is_compiled", lambda c=compiled: c)
+        monkeypatch.setattr(
+            "rigidfleet.kernel.engine.native.has_machine_code", lambda c=compiled: c
+        )
         assert cli.main(["run", "short.toml", "--no-figures", "--force"]) == codes.PASSED
         assert (words in capsys.readouterr().err) is not compiled
 

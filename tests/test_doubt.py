@@ -19,10 +19,10 @@ from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.smoothing import (
     PositionNoise,
     Positions,
+    b_spline_curve,
     fit_noise,
     knots_over,
     smooth,
-    spline_of_points,
 )
 from rigidfleet.setpoints import ways_of
 from rigidfleet.simulation.as_logged import Doubts, judge_log
@@ -122,7 +122,7 @@ def test_intervals_of_positions_hold(kind: str, count: int) -> None:
         curve = noisy(kind, random).curves[0]
         log = Positions(curve.time, curve.at(curve.time)[:, :3], np.ones(len(curve.time)))
         likely = smooth(log, PositionNoise(SIGMA, tau), knots_over(log.time, 0.0, 0.025))
-        ways = spline_of_points(likely.knots, likely.draw(40, random)).at(t)
+        ways = b_spline_curve(likely.knots, likely.draw(40, random)).at(t)
         drawn = np.std(ways, axis=2)
         held.append(np.abs(likely.way.at(t) - places(t)[:, 0]) < 1.96 * drawn)
     assert np.mean(held) > 0.9

@@ -17,7 +17,7 @@ from rigidfleet.cli.app import main
 from rigidfleet.sweep import Sweep, faults, figures, fly, load
 from rigidfleet.sweep.faults import Drill, GeometricFault, Show
 from rigidfleet.sweep.run import fly_runs
-from rigidfleet.sweep.summary import fault_rates, summarise
+from rigidfleet.sweep.summary import failure_rates, summarise
 
 log = log_file  # the fixture
 #: Least distance of the shows here, and radius of their vehicles [m].
@@ -284,10 +284,10 @@ def test_a_drill_is_a_sweep_over_its_faults(drilled):
 def test_the_worst_run_of_each_fault_is_drawn(drilled):
     """Dots are where two vehicles come as near as the words of the run say, or one crosses a fence, at that time."""
     _, _, table = drilled
-    figure = figures.worst_runs(table)
+    figure = figures.worst_run_maps(table)
     assert figure is not None
     worst = {}
-    for case in (case for case in fault_rates(table) if case.worst):
+    for case in (case for case in failure_rates(table) if case.worst):
         known = worst.setdefault(case.fault, case)
         worst[case.fault] = min(known, case, key=lambda x: x.separation or 0.0)
     axes = [ax for ax in figure.axes if ax.lines]

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import nnls
 
 import rigidfleet as rf
-from rigidfleet.kernel.segments import hull_distance
+from rigidfleet.kernel.segments import hull_gap
 
 MODELS = ("paper", "px4-sih", "hummingbird", "crazyflie", "x500")
 
@@ -106,7 +106,7 @@ def test_the_distance_of_hulls_is_that_of_a_quadratic_programme():
         x = (p[:, None] - q[None]).reshape(-1, 3)
         weight = nnls(np.vstack([x.T, np.full(len(x), 1e3)]), np.array([0.0, 0.0, 0.0, 1e3]))[0]
         exact = float(np.linalg.norm(weight @ x / weight.sum()))
-        found = hull_distance(
+        found = hull_gap(
             np.ascontiguousarray(p[:3]), 2, np.ascontiguousarray(p[3:]),
             np.ascontiguousarray(q[:3]), 2, np.ascontiguousarray(q[3:]), math.nan, np.zeros(3),
         )  # fmt: skip

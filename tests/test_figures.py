@@ -775,7 +775,7 @@ def test_a_formation_shows_its_graph(n, formation):
 def test_a_graph_without_slots_is_spread_out():
     """A chain of four distances is drawn as a line: each shortest path as long as it is."""
     result = a_flight(n=4, formation=CHAIN)
-    places, placed = sketches.sketch_places(result.mission, "shape")
+    places, placed = sketches.slots_or_layout(result.mission, "shape")
     assert not placed
     np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), 4.0, atol=1e-6)
     assert np.linalg.norm(places[0] - places[3]) == pytest.approx(12.0)

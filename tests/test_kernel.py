@@ -27,7 +27,7 @@ from rigidfleet.kernel import (
 )
 from rigidfleet.kernel.compiler.cache import cache_directory
 from rigidfleet.kernel.engine import build, native, packing
-from rigidfleet.kernel.engine.native import is_compiled
+from rigidfleet.kernel.engine.native import has_machine_code
 from rigidfleet.kernel.problem import (
     EXACT,
     SHAPE,
@@ -790,12 +790,12 @@ def test_samples_lie_on_the_flight():
 def test_nothing_is_compiled_twice(tmp_path, monkeypatch):
     """The kernel is in the cache once it has flown; the folder is named by its sources."""
     simulate(a_mission(), times=[6.0])
-    assert is_compiled()
+    assert has_machine_code()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     folder = cache_directory()
     assert folder.is_relative_to(tmp_path)
     assert folder == cache_directory()
-    assert not is_compiled()
+    assert not has_machine_code()
 
 
 def test_a_flight_needs_no_compiler():

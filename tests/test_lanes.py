@@ -9,7 +9,7 @@ import pytest
 from rigidfleet.kernel.compiler.simd import (
     as_lanes,
     fill_lanes,
-    lane_sum_or_worst,
+    one_flight_sum_or_worst,
     pack_lanes,
     rough_inverse,
     unpack,
@@ -89,7 +89,7 @@ def test_an_error_is_a_sum_of_one_flight_and_the_worst_of_eight():
         squares = fill_lanes(0.0)
         for k in range(y.shape[0]):
             squares += y[k] * y[k]
-        return lane_sum_or_worst(squares, x)
+        return one_flight_sum_or_worst(squares, x)
 
     assert error(VALUES.ravel()) == pytest.approx((VALUES**2).sum(), rel=1e-14)
     assert error(pack_lanes(VALUES)) == pytest.approx((VALUES**2).sum(axis=0).max(), rel=1e-14)

@@ -68,13 +68,13 @@ def test_a_level_that_cannot_be_run(fixed, monkeypatch, machine, capsys, tmp_pat
 def shipped(base, tmp_path, monkeypatch):  # noqa: F811
     """A folder of the package's own machine code, with a shared object whose functions return a number."""
     monkeypatch.setattr(
-        objects, "shared_object_path", lambda of, digest: tmp_path / f"{of}-{digest}.so"
+        objects, "shipped_object_path", lambda of, digest: tmp_path / f"{of}-{digest}.so"
     )
-    monkeypatch.setattr(native, "shared_object_path", objects.shared_object_path)
+    monkeypatch.setattr(native, "shipped_object_path", objects.shipped_object_path)
     source = tmp_path / "code.c"
     names = map(objects.symbol_name, objects.ENTRIES["flight"])
     source.write_text("\n".join(f"long {x}(long a) {{ return {SHIPPED}; }}" for x in names))
-    file = objects.shared_object_path(levels.target_instruction_level(), cache.sources_digest())
+    file = objects.shipped_object_path(levels.target_instruction_level(), cache.sources_digest())
     subprocess.run(["cc", "-shared", "-fPIC", "-o", file, source], check=True)
     return file
 
@@ -83,7 +83,7 @@ def shipped(base, tmp_path, monkeypatch):  # noqa: F811
 def test_shipped_code_is_loaded(shipped, monkeypatch):
     """Code that came with the package, made of its sources, goes before the cache, and nothing is compiled."""
     monkeypatch.delattr(native, "_compile_part")
-    assert native.is_compiled()
+    assert native.has_machine_code()
     assert answer() == SHIPPED
 
 
@@ -94,7 +94,7 @@ def test_code_of_other_sources_is_not_loaded(shipped, base):  # noqa: F811
     shipped.rename(shipped.with_name(f"{levels.target_instruction_level()}-0123456789abcdef.so"))
     (file,) = base.rglob("flight-*.o")
     file.unlink()
-    assert not native.is_compiled()
+    assert not native.has_machine_code()
     with pytest.warns(RuntimeWarning, match="sources were changed since its machine code was made"):
         assert answer() == OWN
     with warnings.catch_warnings():
@@ -105,7 +105,7 @@ def test_code_of_other_sources_is_not_loaded(shipped, base):  # noqa: F811
 @linux
 def test_code_of_another_level_is_not_loaded(shipped):
     """Code of a level that is neither fixed nor the machine's highest is left alone."""
-    shipped.rename(objects.shared_object_path("x86-64-v1", cache.sources_digest()))
+    shipped.rename(objects.shipped_object_path("x86-64-v1", cache.sources_digest()))
     assert answer() == PLANTED
 
 
@@ -149,4 +149,4 @@ def test_a_refused_level_is_an_error_from_python(monkeypatch, machine):
     """From Python a level that cannot be run is the package's own error."""
     monkeypatch.setenv(levels.KEY, "x86-64-v4")
     with pytest.raises(RigidfleetError, match="cannot run"):
-        native.is_compiled()
+        native.has_machine_code()

@@ -46,7 +46,7 @@ def mission(**changes) -> Mission:
 
 def flown(pilot: Pilot, seconds: float) -> list:
     """Records of all ticks."""
-    return [pilot.step() for _ in range(round(seconds / TICK))]
+    return [pilot.fly_tick() for _ in range(round(seconds / TICK))]
 
 
 def worst(records: list, name: str) -> float:
@@ -69,7 +69,7 @@ def test_follows_the_hand():
     start, yaw = pilot.target.r.copy(), pilot.target.euler[2]
     for _ in range(40):
         pilot.steer(np.array([1.0, -0.5, 0.25]), np.array([0.0, 0.0, 0.3]))
-        pilot.step()
+        pilot.fly_tick()
     np.testing.assert_allclose(pilot.target.r - start, [2.0, -1.0, 0.5], atol=1e-9)
     assert pilot.target.euler[2] - yaw == pytest.approx(0.6)
     pilot.steer(np.zeros(3), np.zeros(3))
@@ -89,7 +89,7 @@ def test_quadrotors_follow_the_hand(yaw):
     records = []
     for _ in range(120):
         pilot.steer(np.array([1.5, 0.5, 0.0]), np.array([0.0, 0.0, 0.3]))
-        records.append(pilot.step())
+        records.append(pilot.fly_tick())
     assert pilot.flight.ending == ""
     assert max(map(slot_error, records)) < 0.02
     assert worst(records, "saturated") == 0.0
@@ -127,7 +127,7 @@ def test_stays_rigid():
             pilot.steer(rng.normal(size=3), 0.4 * rng.normal(size=3))
         if k == 60:
             pilot.change_formation("line")
-        records.append(pilot.step())
+        records.append(pilot.fly_tick())
     assert pilot.formation == "line"
     assert worst(records, "constraint") < 1e-6
     assert max(map(slot_error, records)) < 1e-6
@@ -147,7 +147,7 @@ def test_one_change_after_another():
     """A change of formation waits until the one before is over; asking for the present one cancels it."""
     pilot = Pilot(TRIANGLE)
     pilot.change_formation("line")
-    pilot.step()
+    pilot.fly_tick()
     assert (pilot.formation, pilot.waiting, pilot.is_changing) == ("triangle", "line", True)
     flown(pilot, 4.1)
     assert (pilot.formation, pilot.waiting, pilot.is_changing) == ("line", None, True)
@@ -234,7 +234,7 @@ def test_cannot_go_on(monkeypatch):
         raise StoppedError("too steep")
 
     monkeypatch.setattr(pilot.flight._active, "fly_to", stop)
-    after = pilot.step()
+    after = pilot.fly_tick()
     assert pilot.flight.ending == "too steep"
     assert after is before
 
@@ -331,7 +331,7 @@ def test_a_ball_is_drawn():
     pilot.pull_ball(ball.slot, start + [6.0, 0.0, 0.0])
     before = ball.place
     for _ in range(20):
-        pilot.step()
+        pilot.fly_tick()
         assert np.linalg.norm(ball.place - before) <= balls.FASTEST * TICK + 1e-12
         before = ball.place
     assert ball.place[0] > start[0] + 2.0
@@ -374,7 +374,7 @@ def test_eight_balls_at_once():
         assert pilot.add_ball(up + [k, 0.0, 0.0], 0.3, np.zeros(3)).slot == k
     with pytest.raises(ValueError, match="remove one first"):
         pilot.add_ball(up, 0.3, np.zeros(3))
-    pilot.step()
+    pilot.fly_tick()
     pilot.remove_ball(3)
     with pytest.raises(ValueError, match="gone"):
         pilot.pull_ball(3, up)
@@ -387,7 +387,7 @@ def test_the_target_stays_out_of_obstacles():
     pilot = settled()
     for _ in range(100):
         pilot.steer(np.array([1.0, 0.0, -2.0]), np.zeros(3))
-        pilot.step()
+        pilot.fly_tick()
     assert pilot.held_off == "ground"
     slots = target_slots(pilot)
     assert 0.25 <= slots[:, 2].min() < 0.25 + 0.1 + 2.0 * TICK
@@ -395,11 +395,11 @@ def test_the_target_stays_out_of_obstacles():
     flown(pilot, 4.0)
     assert places(pilot)[:, 2].min() > 0.25
     pilot.steer(np.array([0.0, 0.0, 1.0]), np.zeros(3))
-    pilot.step()
+    pilot.fly_tick()
     assert pilot.held_off == ""
     for _ in range(400):
         pilot.steer(np.array([4.0, 0.0, 0.0]), np.zeros(3))
-        pilot.step()
+        pilot.fly_tick()
     assert pilot.held_off == "hall"  # its west side is at x = 21 m
     slots = target_slots(pilot)
     assert 20.75 - 0.3 <= slots[:, 0].max() <= 20.75
@@ -428,7 +428,7 @@ def test_points_fly_with_the_guard():
     records = flown(pilot, 8.0)
     for k in range(120):
         pilot.steer(np.array([1.0, -0.5, 0.25]), np.array([0.0, 0.0, 0.3 * (k < 40)]))
-        records.append(pilot.step())
+        records.append(pilot.fly_tick())
     assert max(map(slot_error, records)) < 6e-3
     result = pilot.result()
     assert "pushed" not in result.statistics  # no gust has blown
@@ -474,7 +474,7 @@ def by_hand(pilot: Pilot, seconds: float, change: float = math.inf) -> list:
             pilot.change_formation(
                 next(name for name in pilot.formations if name != pilot.formation)
             )
-        records.append(pilot.step())
+        records.append(pilot.fly_tick())
     return records
 
 
@@ -529,7 +529,7 @@ def test_kept_in_bounded_memory():
     pilot = Pilot(TRIANGLE)
     pilot.archive.most = 20_000.0
     records = by_hand(pilot, 40.0, change=20.0)
-    kept = sum(sum(x.size for x in p.record) for p in pilot.archive.pieces())
+    kept = sum(sum(x.size for x in p.forces_and_references) for p in pilot.archive.pieces())
     assert kept < 25_000  # with ends
     assert pilot.archive.step > 0.05
     result = pilot.result()

@@ -453,7 +453,7 @@ def test_a_live_flight_goes_on():
     """The pilot decides: a loss ends no phase flown live, and the record repeats what was flown."""
     pilot = Pilot(mission({"lost": [{"agent": 2, "time": 6.0}], "on_loss": "land"}))
     while pilot.t < 8.0:
-        pilot.step()
+        pilot.fly_tick()
     assert not pilot.flight.ending
     result = pilot.result()
     assert result.mission.on_loss == "continue"

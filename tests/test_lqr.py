@@ -341,10 +341,10 @@ def test_drakes_case_of_a_cross_weight():
     assert (
         pytest.approx(np.array([[k1 * k2 / 4.12, k1 - 2.2], [k1 - 2.2, k2 - 1.3]]), rel=1e-13) == P
     )
-    number_from_zero_field, gain = finite_horizon(
+    nonnegative_number_field, gain = finite_horizon(
         A, B, S=np.zeros((2, 2)), time_to_go=40.0, **DRAKE
     )
-    assert pytest.approx(P, abs=1e-5) == number_from_zero_field
+    assert pytest.approx(P, abs=1e-5) == nonnegative_number_field
     assert pytest.approx(K, abs=1e-5) == gain
     stays, gain = finite_horizon(A, B, S=P, time_to_go=2.0, **DRAKE)
     assert pytest.approx(P, abs=1e-12) == stays

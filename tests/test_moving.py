@@ -26,7 +26,7 @@ class One:
         edges, mass = np.zeros((0, 2), dtype=np.int64), np.ones(1)
         self.problem, self.work = plan[0]._replace(graph=graph(edges, mass)), workspace(1, 0)
         points = fleet.quadrotor_arrays([fleet.VehicleDynamics(1.0, point=True)], 0.0)
-        self.flight = fleet.ideal_flight(points, start=0.0, h=T, steps=1)
+        self.flight = fleet.new_ideal_flight(points, start=0.0, h=T, steps=1)
         self.state = fleet.initial_state(self.flight, np.zeros((1, fleet.STATES)), self.work)
         seen = {
             key: options.pop(key) for key in ("reach", "noise", "swerve", "seed") if key in options

@@ -391,11 +391,11 @@ def test_live_flying_loses_messages():
     """The share of messages lost while somebody flies is that of the page's slider from then on."""
     session = Session(mission({}))
     for _ in range(20):
-        session.pilot.step()
+        session.pilot.fly_tick()
     session.execute_command({"loss": 0.9})
     before = session.pilot.result().messages
     for _ in range(200):
-        session.pilot.step()
+        session.pilot.fly_tick()
     messages = session.pilot.result().messages
     assert before is not None
     assert messages is not None

@@ -202,7 +202,7 @@ def test_a_deviation_moves_as_its_derivatives_say(dt):
     asked, e = np.linspace(-1.0, 1.0, 7), 1e-4
     before, now, after = (given_.state_after(dt + k * e, asked, 0.1) for k in (-1, 0, 1))
     for part in range(3):
-        x, y, z = (each.taylor_series()[part] for each in (before, now, after))
+        x, y, z = (each.similarity_series()[part] for each in (before, now, after))
         np.testing.assert_allclose(y[1], (z[0] - x[0]) / (2 * e), atol=1e-3)
         np.testing.assert_allclose(2.0 * y[2], (z[0] - 2 * y[0] + x[0]) / e**2, atol=0.06)
     np.testing.assert_allclose(now.Q @ now.Q.T, np.eye(3), atol=1e-12)

@@ -38,7 +38,7 @@ NO_AIR = {"rotor_drag": (0, 0), "lift": 0.0, "c": (0, 0, 0)}
 
 
 def derivative(vehicle: fleet.VehicleDynamics, S, command, wind) -> np.ndarray:
-    flight = fleet.ideal_flight(
+    flight = fleet.new_ideal_flight(
         fleet.quadrotor_arrays([vehicle] * len(S), G), start=0.0, h=1e-3, steps=1
     )
     return derivatives(flight, np.array(S), np.array(command), np.array(wind))

@@ -345,7 +345,7 @@ def test_the_body_law_and_its_frame():
     apart, turned = [], []
     for h in (8e-3, 4e-3, 2e-3):
         fleet_ = fleet.quadrotor_arrays([POINT] * 3, G)
-        flight = fleet.ideal_flight(fleet_, start=6.0, h=h, steps=1)
+        flight = fleet.new_ideal_flight(fleet_, start=6.0, h=h, steps=1)
         S = fleet.hover_states(fleet_, now.r, now.v)
         q = attitude.quaternion_from_dcm(plan.frame)
         sampled_state = fleet.initial_state(flight, S, work, frame=q)
@@ -525,7 +525,7 @@ def test_rotorpys_closed_loop():
     t, *wanted = setpoints("narrow-passage")
     flown = flown_by_us(PAPER, t, *wanted)
     assert errors(flown, wanted[0]) == pytest.approx(expected, abs=6e-4)
-    hover = np.full(4, PAPER.speed_at(PAPER.m * G / 4))
+    hover = np.full(4, PAPER.rotor_speed_at(PAPER.m * G / 4))
     theirs = np.empty_like(wanted[0])
     for i in range(theirs.shape[1]):
         state = {

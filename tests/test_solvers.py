@@ -49,7 +49,7 @@ def solver_of(p, edges, masses, law, *, eliminated=False, tolerance=1e-13) -> La
     if eliminated:
         steps = solvers.elimination_steps(len(p), edges)
         order = None if steps is None else ordering.pivot_order(steps, edges)
-    setup = Setup(order, cache(partial(solvers.dissection_order, p, edges)), tolerance)
+    setup = Setup(order, cache(partial(solvers.agent_dissection_order, p, edges)), tolerance)
     return LargeSolver(vehicles, edges.astype(np.uint32), law, work, setup)
 
 
@@ -159,10 +159,10 @@ def test_a_solve_starts_from_the_best_of_past_solutions(rng):
     wanted = 3.0 * past[0] + 0.5 * past[1]
     x, gram = np.full((64, 3), np.nan), np.empty((4, 6))
     g = (K @ wanted.ravel()).reshape(64, 3)
-    block_cholesky.project_on_solutions(u, edges, masses, mbar, mu, g, past, gram, x)
+    block_cholesky.project_on_past_solutions(u, edges, masses, mbar, mu, g, past, gram, x)
     np.testing.assert_allclose(x, wanted, atol=1e-9)
     g = rng.normal(size=(64, 3))
-    block_cholesky.project_on_solutions(u, edges, masses, mbar, mu, g, past, gram, x)
+    block_cholesky.project_on_past_solutions(u, edges, masses, mbar, mu, g, past, gram, x)
     rest = g - (K @ x.ravel()).reshape(64, 3)
     np.testing.assert_allclose((past * rest).sum(axis=(1, 2)), 0.0, atol=1e-9)
 
@@ -204,7 +204,9 @@ def test_factor_is_that_of_the_matrix(rng):
     """L L^T is K, block by block, in the order of the dissection."""
     p = lattice(4)
     edges, masses = graphs.neighbour_edges(p, 1.5), rng.uniform(0.5, 2.0, 64)
-    found = ordering.symbolic_factorisation(64, edges, solvers.dissection_order(p, edges), 1e9)
+    found = ordering.symbolic_factorisation(
+        64, edges, solvers.agent_dissection_order(p, edges), 1e9
+    )
     blocks, at = np.empty((len(found.row), 9)), np.empty(64, dtype=np.int64)
     u = directions(p, edges)
     block_cholesky.assemble(
@@ -302,7 +304,7 @@ def test_order_of_the_sweep_is_found_whatever_the_numbers(rng):
 def test_dissection_orders_every_agent_once():
     """A permutation, of coincident points, too."""
     p = np.repeat(lattice(3), 2, axis=0)
-    assert sorted(solvers.dissection_order(p, graphs.complete_graph(54))) == list(range(54))
+    assert sorted(solvers.agent_dissection_order(p, graphs.complete_graph(54))) == list(range(54))
 
 
 def flight(law: str, kind: str, **integrator) -> Mission:
@@ -351,8 +353,8 @@ def test_the_memory_of_a_phase_is_free_when_the_next_one_flies():
         kept += [
             weakref.ref(x)
             for x in (
-                active.solver.solver_for_thread,
-                active.solver.solver_for_thread.workspace.r.base,
+                active.solver.thread_solver,
+                active.solver.thread_solver.workspace.r.base,
             )
         ]
         kept.append(weakref.ref(active.state.K.base))

@@ -82,7 +82,7 @@ def test_low_altitude_values_of_the_specification():
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 1.0])
 def test_even_correlation(correlation):
     """Each agent's variance stays one, and any two have the stated correlation: exactly, as a map of white noise."""
-    x = tb.correlate_evenly(np.eye(5)[:, :, None], correlation)[:, :, 0]
+    x = tb.correlate_agents(np.eye(5)[:, :, None], correlation)[:, :, 0]
     expected = np.full((4, 4), correlation)
     np.fill_diagonal(expected, 1.0)
     np.testing.assert_allclose(x.T @ x, expected, atol=1e-12)

@@ -125,7 +125,7 @@ def begun(
     """Vehicles that hover side by side, or at r (N, 3), under a problem without edges that balances their weight."""
     fleet_ = fleet.quadrotor_arrays(vehicles, G)
     n = len(vehicles)
-    flight = fleet.ideal_flight(fleet_, start=0.0, h=h, steps=steps)
+    flight = fleet.new_ideal_flight(fleet_, start=0.0, h=h, steps=steps)
     problem, work = open_problem(fleet_), workspace(n, 0)
     problem.control.force[:, 2] = fleet_.m * G
     S = fleet.hover_states(fleet_, 10.0 * np.eye(n, 3) if r is None else r, np.zeros((n, 3)))
@@ -149,7 +149,7 @@ def planned(
     plan = plan_phase(mission, leg_of(mission, mission.phases[index], now))
     n = len(now.r)
     fleet_ = fleet.quadrotor_arrays([vehicle] * n, plan.problem.vehicles.g)
-    flight = fleet.ideal_flight(fleet_, start=plan.start, h=h, steps=steps, every=every)
+    flight = fleet.new_ideal_flight(fleet_, start=plan.start, h=h, steps=steps, every=every)
     work = workspace(n, len(plan.edges), solver=plan.problem.law.solver)
     S = fleet.hover_states(fleet_, now.r, now.v)
     return plan.problem, work, flight, with_trail(fleet.initial_state(flight, S, work), rows)

@@ -74,7 +74,7 @@ def read_attribute(file: h5py.File, name: str, kind: Any) -> Any:
         value = value.decode("utf-8", "surrogateescape")
     if not isinstance(value, str):
         raise DamagedError(f"attribute {name} is not text")
-    if not _is_text(value):
+    if not _is_valid_unicode(value):
         raise DamagedError(f"attribute {name} is not UTF-8 text")
     if kind is str:
         return value
@@ -111,7 +111,7 @@ def of_type(value: Any, kind: Any, where: str) -> Any:
         if abs(value) <= _HUGE:
             return float(value)
     elif kind in (str, int, bool) and type(value) is kind:
-        if kind is not str or _is_text(value):
+        if kind is not str or _is_valid_unicode(value):
             return value
     elif origin is list and isinstance(value, list):
         return [of_type(item, inner[0], f"{where}[{k + 1}]") for k, item in enumerate(value)]
@@ -139,7 +139,7 @@ def of_type(value: Any, kind: Any, where: str) -> Any:
 _HUGE = 1e300
 
 
-def _is_text(value: str) -> bool:
+def _is_valid_unicode(value: str) -> bool:
     return re.search("[\ud800-\udfff]", value) is None  # a lone surrogate
 
 

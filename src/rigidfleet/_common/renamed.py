@@ -32,7 +32,7 @@ def rename_hint(key: object, value: object = None) -> str:
     return f"it is now called '{new}'" if new is not None else ""
 
 
-def with_earlier_names(**new: str) -> Callable[[_C], _C]:
+def with_earlier_members(**new: str) -> Callable[[_C], _C]:
     """Give a class its members by earlier names, too: each with the name of now."""
 
     def add_properties(kind: _C) -> _C:

@@ -93,7 +93,7 @@ class TextTable:
     ) -> None:
         self.texts, self.words = _lines(data), words or {}
         self.line, start, self.names, below, self.separator, width = _find_header(self.texts)
-        rows = _read_rows(self.texts, start, width, self.separator, self.line)
+        rows = _read_text_columns(self.texts, start, width, self.separator, self.line)
         self.lines, self.columns, self._faults = rows
         self.named, self.decimal = bool(self.names), ""
         if not self.named and width:
@@ -301,7 +301,7 @@ def _find_header(texts: list[str]) -> tuple[int, int, list[str], list[str], str,
         start = min(rows, default=len(texts))
     below = [x for x in texts[start : start + _HEAD] if x.strip()]
     below = ([x for x in below if x[0] != "#"] or below)[:_SAMPLE]
-    fits = {s: _count_fitting_rows(below, len(names), s) for s in SEPARATORS}
+    fits = {s: _count_rows_and_width(below, len(names), s) for s in SEPARATORS}
     separator = max(SEPARATORS, key=lambda s: (fits[s][0], s == own))
     width, line = len(names) or fits[separator][1], start + (not names)
     row = [x.strip("[]()") for x in split_fields(below[0], separator)] if below else []
@@ -339,7 +339,7 @@ def _find_names(texts: list[str], head: list[int], rows: list[int]) -> tuple[int
     return names
 
 
-def _count_fitting_rows(lines: list[str], width: int, separator: str) -> tuple[int, int]:
+def _count_rows_and_width(lines: list[str], width: int, separator: str) -> tuple[int, int]:
     """How many lines are rows by a separator, and their width: without names, those of numbers and colours alone."""
     rows = [split_fields(_REMARK.sub("", line), separator) for line in lines]
     colour = re.compile(r"#[0-9a-fA-F]{6}")
@@ -350,7 +350,7 @@ def _count_fitting_rows(lines: list[str], width: int, separator: str) -> tuple[i
     return len(fine), Counter(fine).most_common(1)[0][0] if fine else 0
 
 
-def _read_rows(
+def _read_text_columns(
     texts: list[str], start: int, width: int, separator: str, names: int
 ) -> tuple[Ints, list[np.ndarray], list[Fault]]:
     """Lines of the rows, texts of the columns, and faults; read in blocks, as rows of texts take much memory."""

@@ -93,7 +93,7 @@ def fit_alignment(logs: Logs, plan: Plan, clock: str) -> Alignment:
     return Alignment(fit, own, _fit(logs, plan, start, ~every)[2], left)
 
 
-def _residuals_and_jacobian(logs: Logs, plan: Plan, q: Floats) -> tuple[Floats, Floats, Floats]:
+def _residuals_jacobian_times(logs: Logs, plan: Plan, q: Floats) -> tuple[Floats, Floats, Floats]:
     """Off (M, 3), its derivatives (M, 3, 6) by the parameters q, and times (M,) of the plan."""
     rows = []
     c, s = np.cos(q[1]), np.sin(q[1])
@@ -119,7 +119,7 @@ def _fit(
     """
     q, free, errors = (start if guess is None else guess).copy(), free.copy(), np.full(6, np.nan)
     for _ in range(_TURNS):
-        off, slope, time = _residuals_and_jacobian(logs, plan, q)
+        off, slope, time = _residuals_jacobian_times(logs, plan, q)
         if not (len(off) and free.any()):
             break
         for j in np.flatnonzero(free[:3]):  # what the others do not explain of it
@@ -177,7 +177,7 @@ def _misfit_and_setup(logs: Logs, plan: Plan, offset: float) -> tuple[float, Flo
     A turn of any angle with a scale is linear in what it makes of x and y; heights have a scale of their own here.
     """
     q = np.array([offset, *np.zeros(5)])
-    off, slope, _ = _residuals_and_jacobian(logs, plan, q)
+    off, slope, _ = _residuals_jacobian_times(logs, plan, q)
     if len(off) <= 5:
         return np.inf, q
     level = slope[..., 2:3] * np.array([[1.0], [1.0], [0.0]])

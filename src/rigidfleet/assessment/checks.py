@@ -101,7 +101,7 @@ def _completeness_check(result: Result) -> CheckResult:
 
 def _record_consistency_check(measured: Measurements) -> Iterator[CheckResult]:
     """Fail a record that contradicts itself: it has been altered and proves nothing."""
-    contradictions = list(measured.contradictions())
+    contradictions = list(measured.self_contradictions())
     if contradictions:
         words, when = contradictions[0]
         more = f", and {len(contradictions) - 1} more like that" if len(contradictions) > 1 else ""
@@ -302,19 +302,19 @@ def _flying_separation_check(measured: Measurements, q: Quantity) -> Iterator[Ch
     limit, altitude = q.limit_of(measured.mission), measured.mission.limits.separation_altitude
     if limit is not None and measured.worst("separation") is not None:
         e = measured.worst(q.name)
-        words = "no two agents come as near" if e is None else _nearness_in_words(e)
+        words = "no two agents come as near" if e is None else _separation_in_words(e)
         words += f" with one at z = {altitude:g} m or above (limit {limit:g} m)"
         yield limit_check(q, e, limit, words)
 
 
-def _certified_separation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _separation_certificate_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """How much nearer agents come in each phase than its plan's certificate says."""
     allowed, checks = q.limit_of(measured.mission), []
     for record, worst in zip(measured.result.phases, measured.worst_by_phase, strict=True):
         if record.planned is not None and (e := worst.get("separation")) is not None:
             planned = record.planned["separation"]
             words = (
-                f"in phase '{record.name}' {_nearness_in_words(e)};"
+                f"in phase '{record.name}' {_separation_in_words(e)};"
                 f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
             )
             checks.append(limit_check(q, replace(e, value=planned - e.value), allowed, words))
@@ -328,11 +328,11 @@ def _abort_separation_check(measured: Measurements) -> Iterator[CheckResult]:
     every = [x["separation"] for p, x in pairs if p.t_start >= since and "separation" in x]
     if every:
         e = min(every, key=lambda x: x.value)
-        words = f"on the way home {_nearness_in_words(e)} (promised {value(promised, 'm')})"
+        words = f"on the way home {_separation_in_words(e)} (promised {value(promised, 'm')})"
         yield limit_check(replace(QUANTITIES["separation"], name="way_home"), e, promised, words)
 
 
-def _nearness_in_words(e: Extreme) -> str:
+def _separation_in_words(e: Extreme) -> str:
     return f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
 
 
@@ -374,7 +374,7 @@ def _lost_vehicle_checks(measured: Measurements, q: Quantity) -> Iterator[CheckR
             if (first := measured.first_contact(q.name, e)) is not None:
                 words += f"; after that, {first.who} collide, first at {first.when:.2f} s"
             else:
-                words += f"; after that, {_nearness_in_words(e)}"
+                words += f"; after that, {_separation_in_words(e)}"
         yield limit_check(q, e, q.limit_of(measured.mission), words, first=first)
     yield from abandonment_check(measured)
 
@@ -503,7 +503,7 @@ def _tracking_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
 _CHECKS: dict[str, Callable[[Measurements, Quantity], Iterator[CheckResult]]] = {
     "separation": _separation_check,
     "separation_flying": _flying_separation_check,
-    "separation_as_planned": _certified_separation_check,
+    "separation_as_planned": _separation_certificate_check,
     "clearance": _clearance_checks,
     "lost": _lost_vehicle_checks,
     "geofence": _geofence_check,

@@ -58,7 +58,7 @@ class Fit(NamedTuple):
     in_order: bool | None
 
 
-def formation_fits(
+def fit_samples(
     p: Floats, slots: Floats, who: Ints, greatest_error: Callable[[float], float]
 ) -> Iterator[Fit]:
     """Compare a formation as flown at G samples with its slots (N, 3): agents ``who`` (N,) at p (G, N, 3).
@@ -71,9 +71,9 @@ def formation_fits(
     u, s, vt = np.linalg.svd(own.swapaxes(1, 2) @ centred)
     turn, proper = rigid_body.best_rotation(u, s, vt)
     if len(slots) <= _FEW:
-        worst = _worst_pairs(p, slots)
+        worst = _worst_pair_errors(p, slots)
     else:
-        worst = map(_worst_pair, p, repeat(slots), norms(own - centred @ (u @ vt).swapaxes(1, 2)))
+        worst = map(_worst_error, p, repeat(slots), norms(own - centred @ (u @ vt).swapaxes(1, 2)))
     in_order: list[bool | None] = [None] * len(p)
     if len(order) > 2:
         # They follow each other where they extend most.
@@ -101,7 +101,7 @@ def _shape_properties(slots: Floats) -> tuple[int, Floats, list[int], float]:
 _Worst = tuple[float, int, int, float, float]
 
 
-def _worst_pairs(p: Floats, slots: Floats) -> Iterator[_Worst]:
+def _worst_pair_errors(p: Floats, slots: Floats) -> Iterator[_Worst]:
     """Worst errors of a distance at samples p (G, N, 3), among all pairs; of equal errors the first."""
     i, j = proximity.all_pairs(len(slots))
     flown, intended = (norms(x.take(i, axis=-2) - x.take(j, axis=-2)) for x in (p, slots))
@@ -112,7 +112,7 @@ def _worst_pairs(p: Floats, slots: Floats) -> Iterator[_Worst]:
     return zip(*(x.tolist() for x in columns), strict=True)
 
 
-def _worst_pair(p: Floats, slots: Floats, off: Floats) -> _Worst:
+def _worst_error(p: Floats, slots: Floats, off: Floats) -> _Worst:
     """Worst error of a distance of many agents p (N, 3), among all pairs.
 
     Few pairs have to be computed: the error of a pair is at most the sum of both agents' distances ``off`` (N,) from

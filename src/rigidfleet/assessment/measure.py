@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, Quantity, quantity
-from rigidfleet.assessment.fits import Fit, angle_between, formation_fits
+from rigidfleet.assessment.fits import Fit, angle_between, fit_samples
 from rigidfleet.assessment.verdict import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -184,7 +184,7 @@ class Measurements:
         r, things = self.result.position[k, i], self.mission.obstacles
         return proximity.below(r, self.mission.fleet.radius[i], things, self.result.time[k], PAD)
 
-    def contradictions(self) -> Iterator[tuple[str, float]]:
+    def self_contradictions(self) -> Iterator[tuple[str, float]]:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
         r = result.position
@@ -287,7 +287,7 @@ class Measurements:
             slots = mission.formation_slots(name)
             if slots is not None and len(left) > 1 and np.isfinite(r).all():
                 most = mission.formations[name].greatest_error
-                (fits[index],) = formation_fits(r[:, left], slots[left], left, most)
+                (fits[index],) = fit_samples(r[:, left], slots[left], left, most)
         return errors, fits
 
     @property

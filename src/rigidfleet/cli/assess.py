@@ -184,7 +184,7 @@ def assess(
         made.save(result, verdict)
         write_report([result], [verdict], made.report, quiet=json)
         write_replay(result, made.replay)
-        write_figures(result, made.figure_paths(figures, DRAWN), quiet=json)
+        write_figures(result, made.list_figure_paths(figures, DRAWN), quiet=json)
         if not json:
             made.print_paths()
     return {"passed": PASSED, "failed": FAILED, "undecided": UNDECIDED}[verdict.word]

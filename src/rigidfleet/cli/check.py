@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.outputs import mission_file, refuse_overwriting
+from rigidfleet.cli.outputs import refuse_overwriting, with_toml_suffix
 from rigidfleet.errors import MissionError, RigidfleetError
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def check(
     from rigidfleet.mission import load_mission
     from rigidfleet.planning.timing import complete_times, expand_mission
 
-    expand = expand and mission_file(expand)
+    expand = expand and with_toml_suffix(expand)
     refuse_overwriting(expand, force=force, other="give another path")
     refuse_overwriting(out, force=force, other="give another folder")
     if out is not None and not abort:

@@ -47,11 +47,11 @@ def export(
     """
     from rigidfleet.assessment import assess
     from rigidfleet.interchange import export as write
-    from rigidfleet.interchange import format_of
+    from rigidfleet.interchange import format_by_name
     from rigidfleet.result import as_result
 
     try:
-        chosen = format_of(format)
+        chosen = format_by_name(format)
     except ValueError as error:
         raise RigidfleetError(f"{error}.") from None
     flight = as_result(result)

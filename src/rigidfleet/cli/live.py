@@ -39,11 +39,11 @@ def live(
     no_browser : bool
         Print the address without opening a browser.
     """
-    from rigidfleet.kernel.engine.native import is_compiled
+    from rigidfleet.kernel.engine.native import has_machine_code
     from rigidfleet.mission import load_mission
 
     flown = load_mission(mission)
-    if not is_compiled():
+    if not has_machine_code():
         console.err().print(console.COMPILING)
     from rigidfleet.web.live import live as fly
 

@@ -14,7 +14,7 @@ from rigidfleet.cli import console
 from rigidfleet.cli.arguments import parse_number, parse_whole, to_whole_number
 from rigidfleet.cli.check import plain_facts
 from rigidfleet.cli.codes import PASSED
-from rigidfleet.cli.outputs import mission_file, refuse_overwriting
+from rigidfleet.cli.outputs import refuse_overwriting, with_toml_suffix
 from rigidfleet.errors import RigidfleetError
 
 
@@ -85,7 +85,7 @@ def new(
     options = {key: value for key, value in all_options.items() if value is not None}
     if not (options or quiet or json or show) and sys.stdin.isatty() and console.err().is_terminal:
         name, options = _ask_for_mission(name)
-    file = mission_file(Path(name or "mission"))
+    file = with_toml_suffix(Path(name or "mission"))
     refuse_overwriting(file, force=force, other="give another name")
     if not show and (formations or shape or "cube") not in SHAPES:  # points make a show
         show, formations = True, formations or options.pop("shape")

@@ -36,7 +36,7 @@ class Files:
         self.verdict = folder / "verdict.json"
         self.report, self.replay = folder / "report.html", folder / "replay.html"
 
-    def figure_paths(
+    def list_figure_paths(
         self, which: Literal["few", "all"] = "all", formats: Iterable[str] | None = None
     ) -> list[Path]:
         """All possible figures, or the few that are looked at after a flight; by default in all formats."""
@@ -49,7 +49,7 @@ class Files:
     @property
     def derived_paths(self) -> list[Path]:
         """All files that are derived from the result."""
-        return [self.verdict, self.table, self.report, self.replay, *self.figure_paths()]
+        return [self.verdict, self.table, self.report, self.replay, *self.list_figure_paths()]
 
     def check_writable(self, *, replace: bool) -> None:
         """Check before a flight that its files can be written.
@@ -132,12 +132,12 @@ class Files:
             if path.exists():
                 how = " (open it in a browser)" if path.suffix == ".html" else ""
                 console.out().print(f"{what:8} {path}{how}", soft_wrap=True)
-        if drawn := [path for path in self.figure_paths() if path.exists()]:
+        if drawn := [path for path in self.list_figure_paths() if path.exists()]:
             text = f"Figures  {drawn[0].parent}{os.sep} ({console.count_text(len(drawn), 'file')})"
             console.out().print(text, soft_wrap=True)
 
 
-def mission_file(path: Path) -> Path:
+def with_toml_suffix(path: Path) -> Path:
     """The path of a mission: with .toml, as reading expects it; a folder is refused."""
     if not path.name:
         raise RigidfleetError(f"{path}: is a folder. Name a file.")

@@ -104,7 +104,7 @@ def report(
             console.out().print(f"\nReport   {page}", soft_wrap=True)
     else:
         console.show_verdict(verdicts[0], quiet=json or quiet)
-        drawn = [] if no_figures else files.figure_paths(figures, format or DRAWN)
+        drawn = [] if no_figures else files.list_figure_paths(figures, format or DRAWN)
         made = [files.verdict, files.report, *drawn]
         kept = [] if force else [path for path in made if path.exists()]
         if files.verdict not in kept:

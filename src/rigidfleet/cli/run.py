@@ -113,7 +113,7 @@ def run(
             if replay:
                 write_replay(result, files.replay)
             if not no_figures:
-                paths = files.figure_paths(figures, format or DRAWN)
+                paths = files.list_figure_paths(figures, format or DRAWN)
                 write_figures(result, paths, quiet=quiet, titles=not no_titles, width=width)
         except KeyboardInterrupt:
             interrupted = True
@@ -171,10 +171,10 @@ def show_progress(
     watch: console.FlightWatch | console.SweepWatch | None,
 ) -> Generator[Callable[..., None] | None]:
     """Show what is computed in this context, and heed interrupts; what is entered receives the progress."""
-    from rigidfleet.kernel.engine.native import is_compiled
+    from rigidfleet.kernel.engine.native import has_machine_code
 
     with watch or nullcontext(), raise_interrupts():
-        if watch is not None and not is_compiled():
+        if watch is not None and not has_machine_code():
             watch.announce_compilation()
         yield None if watch is None else watch.update
 

@@ -151,7 +151,7 @@ def read_log(path: Path, head: bytes) -> Log:
     package = "pyulog" if read is _read_ulog else "pymavlink"
     if find_spec(package) is None:
         raise fault(f"needs the package {package!r}", "Run: pip install rigidfleet[logs]")
-    complaints = _Complaints()
+    complaints = _PrintCounter()
     try:
         with redirect_stdout(complaints), redirect_stderr(complaints):
             log = read(path)
@@ -162,7 +162,7 @@ def read_log(path: Path, head: bytes) -> Log:
     return log._replace(notes=(*log.notes, DAMAGED)) if damaged else log
 
 
-class _Complaints(io.TextIOBase):
+class _PrintCounter(io.TextIOBase):
     """What a package prints of a damaged log: that it does, since it may be a line for each byte."""
 
     count = 0

@@ -60,7 +60,7 @@ def violations(edges: ArrayLike, lengths: ArrayLike) -> list[Violation]:
     for i, j in pairs:
         after[i].add(j)
     broken: list[Violation] = []
-    for size, excess_of in ((3, _excess_of_triangles), (4, _squared_volumes)):
+    for size, excess_of in ((3, _triangle_inequality_excess), (4, _squared_volumes)):
         cliques = list(_cliques(after, size))
         numbers = (index[pair] for agents in cliques for pair in combinations(agents, 2))
         sides = np.fromiter(numbers, np.int64).reshape(-1, size * (size - 1) // 2)
@@ -85,7 +85,7 @@ def _cliques(after: dict[int, set[int]], size: int) -> Iterator[tuple[int, ...]]
     return extend((), set(after))
 
 
-def _excess_of_triangles(sides: Floats) -> tuple[Floats, Floats]:
+def _triangle_inequality_excess(sides: Floats) -> tuple[Floats, Floats]:
     """By how much the longest side of triangles (K, 3) [m] is too long, and where that is no rounding."""
     longest = sides.max(axis=1)
     excess = 2 * longest - sides.sum(axis=1)
@@ -146,18 +146,18 @@ def slots_from_distances(n: int, edges: ArrayLike, lengths: ArrayLike) -> Floats
 
 def _turn_to_slot_convention(p: Floats) -> Floats:
     """Turn and mirror centred points (N, 3) to the convention of `slots_from_distances`."""
-    x = _first_direction(p[::-1], p)
+    x = _first_nonzero_direction(p[::-1], p)
     if x is None:
         return p
     across = p - np.outer(p @ x, x)
-    y = _first_direction((a - b for a, b in combinations(across, 2)), p)
+    y = _first_nonzero_direction((a - b for a, b in combinations(across, 2)), p)
     if y is None:
         return np.outer(p @ x, [1.0, 0.0, 0.0])
     out = p @ np.column_stack([x, y, np.cross(x, y)])
     return out * [1, 1, -1] if handedness(out) < 0 else out
 
 
-def _first_direction(vectors: Iterable[Floats], p: Floats) -> Floats | None:
+def _first_nonzero_direction(vectors: Iterable[Floats], p: Floats) -> Floats | None:
     """Unit vector along the first of the vectors that is not small relative to the shape p."""
     small = 1e-6 * np.abs(p).max(initial=0.0)
     return next((v / np.linalg.norm(v) for v in vectors if np.linalg.norm(v) > small), None)

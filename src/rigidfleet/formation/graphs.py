@@ -99,7 +99,7 @@ def henneberg(points: ArrayLike) -> Ints:
             d = ((p[before] - p[some[k]]) ** 2).sum(axis=1)
             few = before[np.argsort(d, kind="stable")[:12]]
             at[k] = np.append(few, np.full(12 - len(few), -1))
-        u, length = _directions_to_neighbours(p, some, at)
+        u, length = _directions_and_distances(p, some, at)
         a, b, c = (u[:, _TRIPLES[:, k]] for k in range(3))
         volume = np.abs((a * np.cross(b, c)).sum(axis=2))
         # Among equally good triples, the one with the shortest edges.
@@ -153,7 +153,7 @@ def _softness_by_triple(p: Floats, some: Ints, at: Ints, soft: Floats) -> Floats
 
     Triples that lie in a plane with the point, or are incomplete, give about 1e18.
     """
-    u, _ = _directions_to_neighbours(p, some, at)
+    u, _ = _directions_and_distances(p, some, at)
     a, b, c = (u[:, _TRIPLES[:, k]] for k in range(3))
     rows = np.cross(b, c), np.cross(c, a), np.cross(a, b)
     volume = (a * rows[0]).sum(axis=2)
@@ -174,7 +174,7 @@ def _edges_of_first_three(order: Ints) -> Ints:
     return np.array([order[[0, 1]], order[[0, 2]], order[[1, 2]]])
 
 
-def _directions_to_neighbours(p: Floats, some: Ints, at: Ints) -> tuple[Floats, Floats]:
+def _directions_and_distances(p: Floats, some: Ints, at: Ints) -> tuple[Floats, Floats]:
     """Unit vectors (k, 12, 3) and distances from points (k,) to others (k, 12); 0 for -1, which means none."""
     x = p[at] - p[some][:, None]
     length = np.linalg.norm(x, axis=2)

@@ -79,7 +79,7 @@ def parse_points(data: bytes, name: str, *, repeated: bool = False) -> Points:
             points, colours, notes = _read_npy(data) if suffix == ".npy" else _read_ply(data)
             lines = np.arange(1, len(points) + 1)
         else:
-            lines, points, colours, notes = _read_table(data)
+            lines, points, colours, notes = _read_point_table(data)
             place = "line"
     except ContentError as error:
         raise MissionError(_findings_of_faults(error.faults, name)) from None
@@ -150,7 +150,7 @@ def _hex_colours(colours: Floats, *, real: bool) -> tuple[str, ...]:
     return tuple(f"#{row.tobytes().hex()}" for row in colours.astype(np.uint8))
 
 
-def _read_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tuple[str, ...]]:
+def _read_point_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tuple[str, ...]]:
     """Lines (N,), points (N, 3), colours and notes of a table.
 
     Raises

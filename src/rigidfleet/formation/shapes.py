@@ -77,11 +77,11 @@ def _shells(size: Floats, n: int) -> Floats:
     def sphere_radius(count: int) -> float:
         return float(np.linalg.norm(_sphere(size, count)[0]))
 
-    def distance_of_neighbours(outer: int) -> float:
+    def shell_distance(outer: int) -> float:
         return sphere_radius(outer) - sphere_radius(n - outer)
 
     numbers = range(n // 2 + 1, n - 3)  # of agents of the outer sphere
-    outer = n // 2 + 1 + bisect_left(numbers, size[0], key=distance_of_neighbours)
+    outer = n // 2 + 1 + bisect_left(numbers, size[0], key=shell_distance)
     if outer not in numbers:
         raise ValueError(f"{n} agents are too few for a sphere inside a sphere")
     return np.concatenate([_sphere(size, outer), _sphere(size, n - outer)])

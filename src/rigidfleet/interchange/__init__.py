@@ -197,7 +197,7 @@ def export(
         ``result`` is neither a flight nor a path.
     """
     result, path = as_result(result), as_path(path)
-    chosen = format_of(format)
+    chosen = format_by_name(format)
     if format == "setpoints" and path.suffix != ".csv":
         chosen = chosen._replace(write=_write_vehicle_tables, each=True)
     setting = _rate_or_tolerance(format, chosen, rate, tolerance)
@@ -222,7 +222,7 @@ def export(
     )  # fmt: skip
 
 
-def format_of(name: str) -> Format:
+def format_by_name(name: str) -> Format:
     """The format of a name.
 
     Raises

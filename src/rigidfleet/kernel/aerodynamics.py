@@ -15,7 +15,7 @@ jet = jit_inline(downwash_speed)
 
 
 @jit
-def air_velocity(t, h, around, out):
+def air_velocity_in_step(t, h, around, out):
     """Velocity of the air at each vehicle [m/s] at t, t + h/2 and t + h, into out (3, N, 3)."""
     for s in range(3):
         row = out[s]

@@ -219,7 +219,7 @@ def avoidance_arrays(
         late=np.zeros(n), shifted=np.zeros((4, 3)), trial=np.zeros((5, 3)), normal=np.zeros(3),
         hold=np.ones(n), pull=np.zeros(edges),
         system=np.zeros((EXACT, EXACT)), right=np.zeros(EXACT), active=np.zeros(EXACT, dtype=np.int64),
-        count=np.zeros(3, dtype=np.int64), **_arrays_by_obstacle(n, count), **_empty_avoidance_record(n),
+        count=np.zeros(3, dtype=np.int64), **_barrier_arrays(n, count), **_empty_avoidance_record(n),
     )  # fmt: skip
 
 
@@ -239,11 +239,11 @@ def with_obstacles(avoidance: AvoidanceArrays, solids: Solids) -> AvoidanceArray
     for mine, old in zip(seen[-4:], before[-4:], strict=True):  # what is known
         mine[: len(old)] = old
     return avoidance._replace(
-        solids=solids, sight=seen, **_arrays_by_obstacle(len(avoidance.b), len(solids.kind))
+        solids=solids, sight=seen, **_barrier_arrays(len(avoidance.b), len(solids.kind))
     )
 
 
-def _arrays_by_obstacle(n: int, count: int) -> dict[str, Any]:
+def _barrier_arrays(n: int, count: int) -> dict[str, Any]:
     """Arrays whose size depends on the number of obstacles."""
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
     rows = min(capacity // 2, _BARRIERS * n) + 2 * n * count

@@ -225,7 +225,7 @@ def inner(a, b):
 
 
 @jit
-def project_on_solutions(u, edges, m, mbar, mu, g, past, G, x):
+def project_on_past_solutions(u, edges, m, mbar, mu, g, past, G, x):
     """x (N, 3) = the combination of past solutions (P, N, 3) that is nearest to the solution of K x = g.
 
     Nearest in the norm of K, so that its residual is orthogonal to all of them (Fischer, 1998). Solutions that depend

@@ -114,7 +114,7 @@ def update_greatest_error(i, k, error, net, mail, own):
 
 
 @jit
-def retime_plan(i, k, t, p, w, flight, state):
+def apply_own_clock(i, k, t, p, w, flight, state):
     """Turn the plan in w, evaluated at the time of vehicle i's own clock, into what i flies at tick k, t [s].
 
     The slots of i and its neighbours and the lengths of their edges change by the chain rule; then follows the input

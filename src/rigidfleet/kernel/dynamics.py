@@ -66,7 +66,7 @@ def closed_loop(t, y, dy, p, w):
             mean_axes(r, v, m, vehicles.M, w)
     write_accelerations(dy, p, w)
     if p.body_formulation:
-        body_derivatives(y, dy, p, w)
+        body_frame_derivatives(y, dy, p, w)
     if p.has_frame:
         multiply(T, w.cm[2], w.cm[4])
         quaternion_rate(y[q : q + 4], w.cm[4], dy[q : q + 4])
@@ -120,7 +120,7 @@ def turn_to_world(T, x, origin, out):
 
 
 @jit
-def body_derivatives(y, dy, p, w):
+def body_frame_derivatives(y, dy, p, w):
     """The paper's equations of motion in the body frame, Eqs. (15), (16), in their well-posed form.
 
     The paper's pair for d2x/dt2 and domega/dt is linearly dependent: omega of a deforming body is

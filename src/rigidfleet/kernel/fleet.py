@@ -90,11 +90,11 @@ class VehicleDynamics:
     point: bool = False
     limit: float = np.inf  # of a point's force [N]
 
-    def thrust_at(self, speed: ArrayLike) -> Floats:
+    def rotor_thrust_at(self, speed: ArrayLike) -> Floats:
         """Thrust [N] of a rotor at a speed [rad/s]."""
         return thrust_of(np.asarray(speed, dtype=float), *_as_three_floats(self.thrust))
 
-    def speed_at(self, thrust: ArrayLike) -> Floats:
+    def rotor_speed_at(self, thrust: ArrayLike) -> Floats:
         """Speed [rad/s] of a rotor with a thrust [N]."""
         return speed_of(np.asarray(thrust, dtype=float), *_as_three_floats(self.thrust))
 
@@ -105,8 +105,8 @@ class VehicleDynamics:
         """
         if self.point:
             return np.zeros((4, 4))
-        hover = self.speed_at(0.25 * self.m * g or 0.5 * self.thrust_at(self.speed)[1])
-        ratio = thrust_of(hover, *_as_three_floats(self.torque)) / self.thrust_at(hover)
+        hover = self.rotor_speed_at(0.25 * self.m * g or 0.5 * self.rotor_thrust_at(self.speed)[1])
+        ratio = thrust_of(hover, *_as_three_floats(self.torque)) / self.rotor_thrust_at(hover)
         rotors, spin = np.asarray(self.rotors, dtype=float), np.asarray(self.spin, dtype=float)
         mixing = np.stack([np.ones(4), rotors[:, 1], -rotors[:, 0], ratio * spin])
         if np.linalg.matrix_rank(mixing) < 4:
@@ -351,7 +351,7 @@ def quadrotor_arrays(vehicles: Sequence[VehicleDynamics], g: float = 9.81) -> Qu
     ]
     return Quadrotors(
         **{name: parameter_rows(name) for name in names},
-        force=np.array([v.thrust_at(v.speed) for v in vehicles]),
+        force=np.array([v.rotor_thrust_at(v.speed) for v in vehicles]),
         unmix=np.array([v.allocation_matrix(g) for v in vehicles]),
         span=np.array([[gap.min(), gap.max()] for gap in gaps]),
         point=np.array([v.point for v in vehicles]),
@@ -386,7 +386,7 @@ def no_commands(n: int) -> Commands:
     )
 
 
-def ideal_flight(
+def new_ideal_flight(
     vehicles: Quadrotors, *, start: float, h: float, steps: int, every: int = 1
 ) -> SampledFlight:
     """A flight in still air with exact sensing; see `SampledFlight`. Replace parts of it by ``_replace``."""

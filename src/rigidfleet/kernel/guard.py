@@ -29,15 +29,15 @@ from rigidfleet.kernel.avoidance import (
     PAIR,
     TICKS,
 )
-from rigidfleet.kernel.barriers import filter_accelerations, limit_thrust, subtract_released_forces
+from rigidfleet.kernel.barriers import filter_accelerations, limit_thrust, reduce_edge_forces
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
 from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.moving import (
     braking_relative_to_obstacle,
     is_obstacle_known,
+    margin_to_moving_obstacles,
     miss_distance,
-    moving_obstacle_margin,
     relative_braking_limit,
     required_obstacle_distance,
     steer_round_obstacles,
@@ -48,7 +48,7 @@ from rigidfleet.kernel.moving import (
 from rigidfleet.kernel.rigid_body import attitude_matrix
 from rigidfleet.kernel.sampled_flight import write_measured_states
 from rigidfleet.kernel.segments import (
-    hull_distance,
+    hull_gap,
     obstacle_distance,
     parabola_min,
     refined_obstacle_distance,
@@ -108,7 +108,7 @@ def braking_acceleration(i, v, a, out):
 
 
 @jit
-def accept_candidate(i, far, a):
+def adopt_candidate(i, far, a):
     """Make the candidate ``trial`` the present choice of vehicle i."""
     trial = a.trial
     a.far[i] = far
@@ -127,7 +127,7 @@ def is_apart(i, v, j, s, floor, a):
     """
     mine, other, rise = a.trial, a.ways[j], a.rise[j]
     if a.soft[i] + a.soft[j] > 0.0:  # quadrotors, by their hulls
-        return hull_distance(mine, 2, a.ways[i, 4:], other, 2, other[4:], floor, a.normal) >= floor
+        return hull_gap(mine, 2, a.ways[i, 4:], other, 2, other[4:], floor, a.normal) >= floor
     # After the tick: from then on both may brake, and their stop segments only shrink.
     if segment_distance(mine[1], mine[2], other[1], other[2]) < floor:
         return False
@@ -154,7 +154,7 @@ def is_apart(i, v, j, s, floor, a):
 
 
 @jit
-def keeps_clearance(i, v, far, a):
+def candidate_is_clear(i, v, far, a):
     """Whether the candidate of vehicle i, with a velocity v (3,), keeps its distances from obstacles at rest."""
     way, normal = a.trial, a.normal
     for o in range(a.solids.kind.shape[0]):
@@ -354,7 +354,7 @@ def set_obstacle_distance_floor(t, i, o, r, v, closest, a):
 
 
 @jit
-def brake_and_set_floors(t, r, v, lost, a):
+def brake_and_set_distances(t, r, v, lost, a):
     """Let all vehicles brake, and find the distances that their stop segments keep, as they should or as they do."""
     n, acceleration = a.b.shape[0], a.trial[3]
     for i in range(n):
@@ -366,7 +366,7 @@ def brake_and_set_floors(t, r, v, lost, a):
         for q in range(3):
             a.ways[i, 3, q] = r[i, q] + stop / max(speed, 1e-12) * v[i, q]
         # It stays on the stop segment, also after the tick
-        accept_candidate(i, max(predict_motion(i, r[i], v[i], acceleration, a, a.trial), stop), a)
+        adopt_candidate(i, max(predict_motion(i, r[i], v[i], acceleration, a, a.trial), stop), a)
     # A vehicle that is nearer than it should be keeps what it has: a floor that nobody meets would stop all.
     for i in range(n):
         if lost[i]:
@@ -380,7 +380,7 @@ def brake_and_set_floors(t, r, v, lost, a):
             if apart < need or apart - need < a.margin[PAIR, 0]:
                 if a.soft[i] + a.soft[j] > 0.0:
                     mine, other = a.ways[i], a.ways[j]
-                    kept = hull_distance(mine, 3, mine[4:], other, 3, other[4:], math.nan, a.normal)
+                    kept = hull_gap(mine, 3, mine[4:], other, 3, other[4:], math.nan, a.normal)
                 else:
                     kept = segment_distance(r[i], a.ways[i, 3], r[j], a.ways[j, 3])
                 a.floor[e] = min(need, kept)
@@ -411,7 +411,7 @@ def is_safe(i, r, v, far, a):
         reach = a.floor[e] + far + a.far[j]
         if x * x + y * y + z * z < reach * reach and not is_apart(i, v[i], j, v[j], a.floor[e], a):
             return False
-    return keeps_clearance(i, v[i], far, a)
+    return candidate_is_clear(i, v[i], far, a)
 
 
 @jit
@@ -422,7 +422,7 @@ def is_barrier_active(i, a):
 
 
 @jit
-def propose_candidate(i, k, v, a, c):
+def propose_acceleration(i, k, v, a, c):
     """Candidate k of vehicle i into c (3,): what it wants, fixed ones, then braking relative to its threat."""
     last = a.candidates.shape[0] + 1
     if k == 0:
@@ -445,7 +445,7 @@ def least_margin_if_braking(i, r, v, late, a):
     if late:
         return miss_distance(r[i], v[i], c, a)
     predict_motion(i, r[i], v[i], c, a, a.trial)
-    return moving_obstacle_margin(i, v[i], a)
+    return margin_to_moving_obstacles(i, v[i], a)
 
 
 @jit
@@ -460,7 +460,7 @@ def choose_acceleration(i, r, v, a):
     most, second = -math.inf, -1
     late = a.threat[i] >= 0 and a.late[i] < -_LATE
     for k in range(a.candidates.shape[0] + (2 if a.threat[i] >= 0 else 1)):
-        propose_candidate(i, k, v[i], a, c)
+        propose_acceleration(i, k, v[i], a, c)
         away = 0.0
         for q in range(3):
             away += (c[q] - wanted[q]) ** 2
@@ -469,21 +469,21 @@ def choose_acceleration(i, r, v, a):
         far = predict_motion(i, r[i], v[i], c, a, a.trial)
         if not is_safe(i, r, v, far, a):
             continue
-        room = miss_distance(r[i], v[i], c, a) if late else moving_obstacle_margin(i, v[i], a)
+        room = miss_distance(r[i], v[i], c, a) if late else margin_to_moving_obstacles(i, v[i], a)
         if late or room < 0.0:
             if room > most:
                 most, second = room, k
             continue
         best, nearest = away, k
         if k == 0:
-            accept_candidate(i, far, a)
+            adopt_candidate(i, far, a)
             return 0
     if nearest < 0:
         if second < 0 or least_margin_if_braking(i, r, v, late, a) >= most:
             return 2
         nearest = second
-    propose_candidate(i, nearest, v[i], a, c)
-    accept_candidate(i, predict_motion(i, r[i], v[i], c, a, a.trial), a)
+    propose_acceleration(i, nearest, v[i], a, c)
+    adopt_candidate(i, predict_motion(i, r[i], v[i], c, a, a.trial), a)
     return 1
 
 
@@ -565,7 +565,7 @@ def guard_forces(p, w, flight, state, a):
     n, lost, t = a.b.shape[0], flight.vehicles.lost, state.work.law_time[0]
     r, v, k = a.known[0], a.known[1], state.count[FLIGHT_TICKS]
     if a.filtered:
-        subtract_released_forces(p, w, state, a)
+        reduce_edge_forces(p, w, state, a)
     write_measured_states(k, r, v, flight, state)
     for i in range(n):
         wanted_acceleration(i, state, a)
@@ -586,7 +586,7 @@ def guard_forces(p, w, flight, state, a):
         a.count[FULL] = 1
         return 0
     a.count[TICKS] += 1
-    brake_and_set_floors(t, r, v, lost, a)
+    brake_and_set_distances(t, r, v, lost, a)
     changed = a.filtered and filter_accelerations(t, r, v, lost, p, w, a)
     for k in range(n):
         i = (k + a.count[TICKS]) % n  # each comes first in turn

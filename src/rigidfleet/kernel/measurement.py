@@ -250,7 +250,7 @@ def inertia_inverse_of_line(I, lifted, axis, out):
     first = I[0, 0] + I[1, 1] + I[2, 2]
     second = I[0, 0] * I[1, 1] + I[0, 0] * I[2, 2] + I[1, 1] * I[2, 2]
     second -= I[0, 1] * I[0, 1] + I[0, 2] * I[0, 2] + I[1, 2] * I[1, 2]
-    third = eigenvector_of(I, 0.0, axis)
+    third = eigenvector_of_value(I, 0.0, axis)
     if not second > 0.0:
         for a in range(3):
             for b in range(3):
@@ -270,7 +270,7 @@ def inertia_inverse_of_line(I, lifted, axis, out):
         inertia_inverse(I, out)
         return
     # I + largest n n^T, n the axis of the least inertia, has no small eigenvalue.
-    eigenvector_of(I, x, axis)
+    eigenvector_of_value(I, x, axis)
     for a in range(3):
         for b in range(3):
             lifted[a, b] = I[a, b] + largest * axis[a] * axis[b]
@@ -281,7 +281,7 @@ def inertia_inverse_of_line(I, lifted, axis, out):
 
 
 @jit
-def eigenvector_of(I, x, axis):
+def eigenvector_of_value(I, x, axis):
     """Unit eigenvector of symmetric I (3, 3) for its simple eigenvalue x, into axis (3,); returns det (I - x)."""
     a, d, f = I[0, 0] - x, I[1, 1] - x, I[2, 2] - x
     b, c, e = I[0, 1], I[0, 2], I[1, 2]
@@ -301,7 +301,7 @@ def eigenvector_of(I, x, axis):
 
 
 @jit
-def measure_attitude(m, k, known, line_known, near, work, T):
+def measure_slot_attitude(m, k, known, line_known, near, work, T):
     """Attitude of the slots at sample k into ``m.attitude`` and T (3, 3); returns whether they count as a line.
 
     ``near`` (3, 3) is the attitude expected, commanded (``known``) or that of the sample before. ``line_known`` tells
@@ -377,7 +377,7 @@ def measure_samples(m):
                     for a in range(3):
                         for b in range(3):
                             near[a, b] = m.T_ref[k, a, b]
-                line = m.line[k] = measure_attitude(m, k, commanded, same, near, work, T)
+                line = m.line[k] = measure_slot_attitude(m, k, commanded, same, near, work, T)
                 for a in range(3):
                     for b in range(3):
                         near[a, b] = T[a, b]

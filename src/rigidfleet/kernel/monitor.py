@@ -12,7 +12,7 @@ than both its neighbours, the law is evaluated in between, until the parabola th
 rise: to 1e-5 of the value. The same holds for large formations, whose multipliers are iterated, with one exception:
 constraint forces and tensions below a tenth of the greatest thrust are found to 1e-6 of that thrust, the accuracy that
 the solver's residual allows. Large formations use a separate solver for these evaluations
-(`LargeSolver.solver_for_thread`), because a solver keeps state and another thread calls the monitor. The flight is
+(`LargeSolver.thread_solver`), because a solver keeps state and another thread calls the monitor. The flight is
 therefore the same to the bit with and without a monitor. The extremes do not depend on where the trail is cut, because
 the order of evaluations does not.
 """
@@ -102,7 +102,7 @@ def quaternion_rate_and_length(points, p):
 
 
 @jit
-def rotation_bound(points, p):
+def frame_rotation_bound(points, p):
     """Upper bound of the rotation [rad] of the axes of the states over a step: 0 in the inertial formulation."""
     if not p.body_formulation:
         return 0.0
@@ -117,7 +117,7 @@ def count_pieces(angle):
 
 
 @jit
-def find_body_frames(points, part, parts, p, monitor):
+def find_frames_over_step(points, part, parts, p, monitor):
     """Attitude, centre and its velocity at five knots of a piece of a step, in the body formulation."""
     first = 6 * p.vehicles.m.shape[0] + p.graph.edges.shape[0]
     quaternion = monitor.scratch[0]
@@ -170,7 +170,7 @@ def world_control_points(points, i, moving, p, monitor, out):
 
 
 @jit
-def control_point_from_mean(points, k, i, mean):
+def centred_control_point(points, k, i, mean):
     """Control point k of agent i, from the mean of those of the agents that are monitored."""
     return (
         points[k, 3 * i] - mean[k, 0],
@@ -204,8 +204,8 @@ def rotation_over_step(points, mean, monitor):
     xx = xy = xz = yy = yz = zz = moment_x = moment_y = moment_z = 0.0
     for i in range(monitor.left.shape[0]):
         if monitor.left[i]:
-            x0, y0, z0 = control_point_from_mean(points, 0, i, mean)
-            x1, y1, z1 = control_point_from_mean(points, 4, i, mean)
+            x0, y0, z0 = centred_control_point(points, 0, i, mean)
+            x1, y1, z1 = centred_control_point(points, 4, i, mean)
             x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (z0 + z1)
             dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
             xx, yy, zz = xx + y * y + z * z, yy + x * x + z * z, zz + x * x + y * y
@@ -240,10 +240,10 @@ def bound_distance_changes(p, state, monitor):
     for i in range(monitor.left.shape[0]):
         if not monitor.left[i]:
             continue
-        x, y, z = control_point_from_mean(points, 0, i, mean)
+        x, y, z = centred_control_point(points, 0, i, mean)
         before_x = before_y = before_z = 0.0
         for k in range(5):
-            next_x, next_y, next_z = control_point_from_mean(points, min(k + 1, 4), i, mean)
+            next_x, next_y, next_z = centred_control_point(points, min(k + 1, 4), i, mean)
             after_x, after_y, after_z = next_x - x, next_y - y, next_z - z
             # The rate of a quartic has, in quartic form, k (x_k - x_k-1) + (4 - k) (x_k+1 - x_k) as coefficients; the
             # rotation takes its cross product with the place from it.
@@ -382,7 +382,7 @@ def store_clearance(value, t, i, b, above, monitor):
 
 
 @jit
-def note_departure(i, monitor):
+def note_obstacle_departure(i, monitor):
     """Agent i is away from all obstacles below it: it no longer stands on one, and was not landing."""
     low = monitor.low
     if monitor.standing[i] != 0:
@@ -420,11 +420,11 @@ def watch_obstacles(i, curve, t, h, last, monitor):
         end, _, _, up = tangent_of_box(curve[4, 0], curve[4, 1], curve[4, 2], b, -1, monitor.boxes)
         if end - radius <= monitor.pad and up >= STEEP:
             return
-    note_departure(i, monitor)
+    note_obstacle_departure(i, monitor)
 
 
 @jit
-def watch_distances(first, end, p, state, monitor):
+def watch_trail_distances(first, end, p, state, monitor):
     """Take the extremes of distances and speeds over the steps of a trail from ``first`` to before ``end``."""
     for step in range(first, end):
         watch_step_distances(step, p, state, monitor)
@@ -438,13 +438,13 @@ def watch_step_distances(step, p, state, monitor):
     enclose_agents(points, monitor)
     watch_pairs(SEPARATION, monitor.pairs, points, t, h, monitor)
     watch_pairs(LOST, monitor.struck, points, t, h, monitor)
-    angle = rotation_bound(points, p)
+    angle = frame_rotation_bound(points, p)
     parts = count_pieces(angle)
     h /= parts
     for part in range(parts):
         start = t + part * h
         if p.body_formulation:
-            find_body_frames(points, part, parts, p, monitor)
+            find_frames_over_step(points, part, parts, p, monitor)
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
                 continue
@@ -625,7 +625,7 @@ def step_end_time(step, state):
 
 
 @jit
-def watch_lone_step_forces(step, before, after, p, w, state, monitor):
+def watch_isolated_step_forces(step, before, after, p, w, state, monitor):
     """Search a step that has no neighbour, because of a jump or the end."""
     start, end = state.trail.clock[trail_row_of(step, state), 0], step_end_time(step, state)
     middle, values = 0.5 * (start + end), monitor.gauge[1]
@@ -654,12 +654,12 @@ def watch_forces(last, p, w, state, monitor):
         if new:
             update_force_extremes(after, end, p, monitor)
         if step == 0 and new:
-            watch_lone_step_forces(0, before, after, p, w, state, monitor)
+            watch_isolated_step_forces(0, before, after, p, w, state, monitor)
         if step + 1 < steps:
             then, until = trail.gauge[trail_row_of(step + 1, state)], step_end_time(step + 1, state)
             search_forces_in(earlier, after, then, step, start, end, until, p, w, state, monitor)
         elif last and (step > 0 or not new):
-            watch_lone_step_forces(step, earlier, after, p, w, state, monitor)
+            watch_isolated_step_forces(step, earlier, after, p, w, state, monitor)
     if last or steps == 0:
         monitor.count[STAYED], state.count[TRAILED] = 0, 0
     else:

@@ -89,7 +89,7 @@ def is_in_sight(o, x, y, z, r, lost, a):
 
 
 @jit
-def use_measurement(o, k, x, y, z, u, v, w, a):
+def observe_obstacle(o, k, x, y, z, u, v, w, a):
     """Take a measurement of obstacle o at tick k, at the displacement x, y, z [m] with the velocity u, v, w [m/s]."""
     s = a.sight
     track, spread, seen = s.track[o], s.spread[o], a.shifted[0]
@@ -125,7 +125,7 @@ def update_tracks(t, r, lost, a):
         if s.known[o] != UNKNOWN:
             predict_track(o, T, s)
         if not s.reach < math.inf or is_in_sight(o, x, y, z, r, lost, a):
-            use_measurement(o, k, x, y, z, u, v, w, a)
+            observe_obstacle(o, k, x, y, z, u, v, w, a)
             s.known[o] = FOLLOWED
         if s.known[o] == UNKNOWN:
             continue
@@ -203,7 +203,7 @@ def write_relative_stop(i, o, r, v, a):
 
 
 @jit
-def moving_obstacle_margin(i, v, a):
+def margin_to_moving_obstacles(i, v, a):
     """By how much the candidate of vehicle i keeps its distances from obstacles that move [m]; infinite if it is far.
 
     The candidate is ``trial``, the velocity before it v (3,).

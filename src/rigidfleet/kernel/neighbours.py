@@ -53,7 +53,7 @@ def observe_disturbance(i, dt, v, net, mail):
 
 
 @jit
-def synchronise_edge_integral(l, messages, mail):
+def reduce_integral_difference(l, messages, mail):
     """Draw i's integral of the edge of link l towards j's, both as when the newest message was sent."""
     share = mail.multiplier.shape[1] - 1
     part = min(TOGETHER, UNDER_WAY / max(messages, 1.0))
@@ -73,7 +73,7 @@ def fade_silent_edges(i, k, ticks, net, mail):
         if mail.edge[l] == NONE or mail.stamp[l] < 0:
             mail.grip[l] = 0.0
         elif mail.fresh[l]:
-            synchronise_edge_integral(l, (k - mail.stamp[l]) / net.every, mail)
+            reduce_integral_difference(l, (k - mail.stamp[l]) / net.every, mail)
         mail.fresh[l] = False
 
 

@@ -17,9 +17,9 @@ from rigidfleet.kernel.compiler.jit import compiled_copy, jit
 from rigidfleet.kernel.monitor import (
     clearance_to_beat,
     count_pieces,
-    find_body_frames,
-    note_departure,
-    rotation_bound,
+    find_frames_over_step,
+    frame_rotation_bound,
+    note_obstacle_departure,
     store_clearance,
     world_control_points,
 )
@@ -158,7 +158,7 @@ def distance_bound(x, y, z, b, s):
 
 
 @jit
-def watch_departure(i, curve, t, s, monitor):
+def watch_lift_off(i, curve, t, s, monitor):
     """At the end (time t) of a step, tell whether agent i has left all obstacles below it."""
     if not (monitor.standing[i] != 0 or monitor.low[i, 0] < math.inf):
         return
@@ -172,18 +172,18 @@ def watch_departure(i, curve, t, s, monitor):
             continue
         if is_solid_below(u, v, w, b, s):
             return
-    note_departure(i, monitor)
+    note_obstacle_departure(i, monitor)
 
 
 @jit
 def watch_clearances(points, start, length, p, s, monitor):
     """Take the clearances of a step from ``start`` of a ``length`` [s]: control points (5, n) of the states."""
-    curve, parts = monitor.curves[0], count_pieces(rotation_bound(points, p))
+    curve, parts = monitor.curves[0], count_pieces(frame_rotation_bound(points, p))
     h = length / parts
     for part in range(parts):
         t = start + part * h
         if p.body_formulation:
-            find_body_frames(points, part, parts, p, monitor)
+            find_frames_over_step(points, part, parts, p, monitor)
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
                 continue
@@ -191,4 +191,4 @@ def watch_clearances(points, start, length, p, s, monitor):
             for b in range(s.kind.shape[0]):
                 watch_solid(i, b, curve, t, h, s, monitor)
             if part == parts - 1:
-                watch_departure(i, curve, t + h, s, monitor)
+                watch_lift_off(i, curve, t + h, s, monitor)

@@ -8,14 +8,14 @@ are evaluated at each stage, a user's force in the middle of each step, downwash
 
 import math
 
-from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity
+from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity_in_step
 from rigidfleet.kernel.attitude_control import command_rotors
 from rigidfleet.kernel.clock_records import OFF, RATE, SLOPE
 from rigidfleet.kernel.clocks import (
     advance_clocks,
+    apply_own_clock,
     drop_constraint_force,
     post_clock,
-    retime_plan,
     write_slots_by_own_clock,
 )
 from rigidfleet.kernel.compiler.calls import call_external, call_recorder
@@ -79,7 +79,7 @@ def tick_row(k, every, first):
 
 
 @jit
-def path_at(k, i, q, tables):
+def path_coordinate(k, i, q, tables):
     """Coordinate q of r, v of vehicle i's path at tick k, or the first one of the table; 0 without paths."""
     return tables.path[max(k - tables.first, 0), i, q] if tables.path.shape[0] > 0 else 0.0
 
@@ -95,7 +95,7 @@ def measure_states(k, flight, state):
     n, now = state.S.shape[0], k % depth
     for i in range(n):
         for q in range(6):
-            state.history[now, i, q] = state.S[i, q] - path_at(k, i, q, tables)
+            state.history[now, i, q] = state.S[i, q] - path_coordinate(k, i, q, tables)
     if k % sensing.every == 0:
         u = tick_row(k, sensing.every, tables.first)
         noisy = tables.noise_r.shape[0] > 0
@@ -118,8 +118,8 @@ def evaluate_law(k, t, known, integral, p, w, flight, state, call):
     n, m, y = known.shape[0], integral.shape[0], state.work.law_state[0]
     for i in range(n):
         for q in range(3):
-            y[3 * i + q] = known[i, q] + path_at(k, i, q, flight.tables)
-            y[3 * n + 3 * i + q] = known[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
+            y[3 * i + q] = known[i, q] + path_coordinate(k, i, q, flight.tables)
+            y[3 * n + 3 * i + q] = known[i, 3 + q] + path_coordinate(k, i, 3 + q, flight.tables)
     for c in range(m):
         y[6 * n + c] = integral[c]
     for q in range(4):
@@ -177,7 +177,7 @@ def write_desired_force(k, i, dt, p, w, flight, state):
             compensate_drag(i, w.v_ref[i], guidance.drag[i], vehicles, state)
         for q in range(0 if own else 3):
             if not state.saturated[i]:
-                known = state.seen[i, q] + path_at(k, i, q, flight.tables)
+                known = state.seen[i, q] + path_coordinate(k, i, q, flight.tables)
                 state.error[i, q] += dt * (known - w.r_ref[i, q])
             state.force[i, q] -= m * guidance.k_i[i, q] * state.error[i, q]
         if not vehicles.lost[i]:
@@ -219,7 +219,7 @@ def evaluate_distributed_law(k, t, dt, p, w, flight, state):
             continue
         if flight.clocks.own:
             evaluate_plan(max(t + state.tau[i, OFF], p.motion.knots[0]), p, w)
-            stuck = retime_plan(i, k, t, p, w, flight, state)
+            stuck = apply_own_clock(i, k, t, p, w, flight, state)
         observe_disturbance(i, dt, w.v[i], net, mail)
         fade_silent_edges(i, k, flight.every, net, mail)
         if flight.commands.kind == OWN:
@@ -261,8 +261,8 @@ def write_measured_states(k, r, v, flight, state):
     """Measured states of vehicles at tick k, each of its own, into r and v (N, 3)."""
     for i in range(state.S.shape[0]):
         for q in range(3):
-            r[i, q] = state.seen[i, q] + path_at(k, i, q, flight.tables)
-            v[i, q] = state.seen[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
+            r[i, q] = state.seen[i, q] + path_coordinate(k, i, q, flight.tables)
+            v[i, q] = state.seen[i, 3 + q] + path_coordinate(k, i, 3 + q, flight.tables)
 
 
 @jit
@@ -413,7 +413,7 @@ def find_air_velocity(t, h, S, p, flight, state):
             for q in range(3):
                 work.air[0, i, q], work.air[1, i, q] = S[i, q] + 0.5 * h * S[i, 3 + q], S[i, 3 + q]
         call_external(p.external.address, t + 0.5 * h, work.air[0], work.air[1], state.push)
-    air_velocity(t, h, flight.air, work.air)
+    air_velocity_in_step(t, h, flight.air, work.air)
     if flight.air.downwash:
         add_downwash(state.S, flight.vehicles, flight.air.density, work.T, work.air)
     return abs(state.push.sum()) < math.inf
@@ -449,7 +449,7 @@ def write_samples(t, h, p, flight, state, call):
             for q in range(3):
                 call.f_u[c, i, q], call.f_C[c, i, q] = state.f_u[i, q], state.f_C[i, q]
             for q in range(6):
-                call.seen[c, i, q] = state.seen[i, q] + path_at(
+                call.seen[c, i, q] = state.seen[i, q] + path_coordinate(
                     count[TICKS] - 1, i, q, flight.tables
                 )
             call.saturated[c, i] = state.saturated[i]

@@ -53,7 +53,7 @@ def segment_distance(p, q, r, s):
 
 
 @jit
-def hull_distance(p, last, a, q, end, b, enough, x):
+def hull_gap(p, last, a, q, end, b, enough, x):
     """Least distance [m] between the hulls of p[0], p[1], p[last], a (2, 3) and of q[0], q[1], q[end], b; x (3,): work.
 
     Gilbert's algorithm on the differences of points (SIAM J. Control 4, 1966): a lower bound, exact to 1e-9 unless it
@@ -89,7 +89,7 @@ def hull_distance(p, last, a, q, end, b, enough, x):
 
 
 @jit
-def distance_and_slope(p, q, x, o, solids, normal):
+def segment_distance_and_slope(p, q, x, o, solids, normal):
     """Distance of a point at a share x of a segment from obstacle o, and its rate along it; writes the normal."""
     u, v, w = q[0] - p[0], q[1] - p[1], q[2] - p[2]
     value = obstacle_distance(p[0] + x * u, p[1] + x * v, p[2] + x * w, o, solids, normal)
@@ -104,10 +104,10 @@ def segment_obstacle_distance(p, q, o, solids, enough, normal):
     exact, to rounding, unless it is certain to be at least, or below, ``enough`` (NaN: always). Returns the bound, the
     distance at a share of the segment, and this share, for which ``normal`` (3,) is that of a supporting plane.
     """
-    high, falls = distance_and_slope(p, q, 1.0, o, solids, normal)
+    high, falls = segment_distance_and_slope(p, q, 1.0, o, solids, normal)
     if falls <= 0.0:
         return high, high, 1.0
-    low, rises = distance_and_slope(p, q, 0.0, o, solids, normal)
+    low, rises = segment_distance_and_slope(p, q, 0.0, o, solids, normal)
     if rises >= 0.0:
         return low, low, 0.0
     a, b = 0.0, 1.0
@@ -115,7 +115,7 @@ def segment_obstacle_distance(p, q, o, solids, enough, normal):
     for _ in range(_TANGENTS):
         x = min(max((high - low + rises * a - falls * b) / (rises - falls), a), b)
         bound = low + rises * (x - a)
-        value, rate = distance_and_slope(p, q, x, o, solids, normal)
+        value, rate = segment_distance_and_slope(p, q, x, o, solids, normal)
         if bound >= enough or value < enough or value - bound <= 1e-13:
             break
         if rate < 0.0:

@@ -37,7 +37,7 @@ def dcm_from_quaternion(q: ArrayLike) -> Floats:
     return _stack_matrices(rows)
 
 
-def _dcm_to_quaternion_products() -> Floats:
+def _dcm_to_quaternion_products_map() -> Floats:
     """4 q q^T - 1 (4, 4) of a rotation T (3, 3), which is linear in T: the map (9, 16)."""
     N = np.zeros((3, 3, 4, 4))
     for i in range(3):
@@ -52,7 +52,7 @@ def _dcm_to_quaternion_products() -> Floats:
     return N.reshape(9, 16)
 
 
-_PRODUCTS, _ONE = _dcm_to_quaternion_products(), np.eye(4)
+_PRODUCTS, _ONE = _dcm_to_quaternion_products_map(), np.eye(4)
 
 
 def quaternion_from_dcm(T: ArrayLike) -> Floats:

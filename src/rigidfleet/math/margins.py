@@ -129,7 +129,7 @@ class LoopGains:
 
 
 @lru_cache
-def tracking_error_gain(lag: Lag, laws: LoopGains, drag: float) -> float:
+def reference_error_gain(lag: Lag, laws: LoopGains, drag: float) -> float:
     """Time T [s] by which a vehicle that tracks leaves its reference at most, in any direction, under either law.
 
     The reference's acceleration, jerk and snap are fed forward past the attitude control, so that only rotors and the
@@ -242,7 +242,7 @@ def formation_loops(
     lags : of each agent
     """
     r, m = np.asarray(positions, dtype=np.float64), np.asarray(masses, dtype=np.float64)
-    S = constraint_share_of_input(r, np.asarray(edges, dtype=np.int64).reshape(-1, 2), m, law)
+    S = constraint_share_matrix(r, np.asarray(edges, dtype=np.int64).reshape(-1, 2), m, law)
     rigid = rigid_motions(r, m)
     Q = rigid @ rigid.T
     kinds = [(lag, axis == 2 and not lag.point) for lag in lags for axis in range(3)]
@@ -271,7 +271,7 @@ def tracking_loops(lags: Sequence[Lag]) -> list[Loop]:
     return [Loop(zero, zero, one, (kind,)) for kind in kinds]
 
 
-def constraint_share_of_input(r: Floats, edges: Ints, m: Floats, law: LoopGains) -> Floats:
+def constraint_share_matrix(r: Floats, edges: Ints, m: Floats, law: LoopGains) -> Floats:
     """S (3N, 3N): the law's share of the input, with nearly equal filter factors made equal."""
     if not len(edges):
         return np.zeros((r.size, r.size))

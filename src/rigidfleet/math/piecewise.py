@@ -73,13 +73,13 @@ class Piecewise(NamedTuple):
 
     def states(self, t: Floats, orders: int) -> Floats:
         """Value and derivatives (orders, T, ...) at times (T,) [s]."""
-        return series.derivatives(self.taylor_coefficients(t, orders))
+        return series.taylor_derivatives(self.taylor_coefficients(t, orders))
 
     def states_at_ends(self, orders: int) -> tuple[Floats, Floats]:
         """Value and derivatives (orders, K, ...) at the beginning and at the end of each piece."""
         times = np.zeros(len(self.pieces)), np.diff(self.time)
         begin, end = (series.polynomial_series(self.pieces, t, orders) for t in times)
-        return series.derivatives(begin), series.derivatives(end)
+        return series.taylor_derivatives(begin), series.taylor_derivatives(end)
 
     def at_shares(self, shares: Floats) -> Floats:
         """Values (K, S, ...) of each piece at shares (S,) of its time."""
@@ -96,7 +96,7 @@ class Piecewise(NamedTuple):
         """Jumps (orders, K - 1, ...) of value and derivatives at the inner knots."""
         end = series.polynomial_series(self.pieces[:-1], np.diff(self.time)[:-1], orders)
         begin = series.polynomial_series(self.pieces[1:], np.zeros(len(self.pieces) - 1), orders)
-        return series.derivatives(begin - end)
+        return series.taylor_derivatives(begin - end)
 
     def shift_time(self, start: float) -> Piecewise:
         """The same, begun later [s]."""

@@ -54,7 +54,7 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
     if not left.all():  # agents without a position do not affect the others
         return separation_of_remaining(r, radius, left)
     if r.shape[1] > _MANY:
-        return _closest_of_many(r, radius)
+        return _closest_pair_of_many(r, radius)
 
     def surface_distance(d: Floats, radii: Floats) -> Floats:
         return root_of_squares(d) - radii
@@ -113,7 +113,7 @@ def root_of_squares(d: Floats) -> Floats:
     return np.sqrt(d[0])
 
 
-def _closest_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
+def _closest_pair_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
     """`separation` of many agents r (K, N, 3), all finite, in O(N log N) per sample: a tree finds the near pairs."""
     from scipy.spatial import KDTree
 

@@ -105,4 +105,4 @@ def _unit_vectors(v: Floats) -> tuple[Floats, Floats]:
 def _cross_with_derivatives(a: Floats, b: Floats) -> Floats:
     """Cross product of two vectors with two derivatives, (K, 3, 3) each."""
     x, y = (series.series_by_derivatives(v.swapaxes(0, 1)) for v in (a, b))
-    return series.derivatives(series.product(x, y, np.cross)).swapaxes(0, 1)
+    return series.taylor_derivatives(series.product(x, y, np.cross)).swapaxes(0, 1)

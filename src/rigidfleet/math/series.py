@@ -23,17 +23,17 @@ _RECIPROCALS = np.array([1.0 / math.factorial(k) for k in range(64)])
 _FACTORIALS = np.array([float(math.factorial(k)) for k in range(64)])
 
 
-def derivatives(x: Floats) -> Floats:
+def taylor_derivatives(x: Floats) -> Floats:
     """Derivatives 0 to n (n + 1, ...) of a series; factorials are multiplied in."""
-    return x * _factorials_per_order(x)
+    return x * _factorial_column(x)
 
 
 def series_by_derivatives(x: Floats) -> Floats:
     """The series of which `derivatives` are ``x`` (n + 1, ...)."""
-    return x / _factorials_per_order(x)
+    return x / _factorial_column(x)
 
 
-def _factorials_per_order(x: Floats) -> Floats:
+def _factorial_column(x: Floats) -> Floats:
     return _FACTORIALS[: len(x)].reshape(-1, *(1,) * (x.ndim - 1))
 
 

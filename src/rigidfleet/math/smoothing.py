@@ -88,7 +88,7 @@ class Smoothed:
     @property
     def way(self) -> Piecewise:
         """The likely way: pieces (M, 3, 5)."""
-        return spline_of_points(self.knots, self.points)
+        return b_spline_curve(self.knots, self.points)
 
     def draw(self, count: int, random: np.random.Generator) -> Floats:
         """Control points (M + 4, 3, count) of ways as likely as the true one, given the samples."""
@@ -96,7 +96,7 @@ class Smoothed:
         return self.points[..., None] + _draw_normals(self.factor, normal).reshape(-1, 3, count)
 
 
-def spline_of_points(knots: Floats, points: Floats) -> Piecewise:
+def b_spline_curve(knots: Floats, points: Floats) -> Piecewise:
     """The spline with control points (M + 4, ...) on even knots (M + 1,) [s]: pieces (M, ..., 5)."""
     h, spans = knots[1] - knots[0], len(knots) - 1
     windows = np.stack([points[k : k + spans] for k in range(_POINTS)], axis=-1)

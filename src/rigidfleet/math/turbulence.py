@@ -30,7 +30,7 @@ def low_altitude_gusts(height: float, wind: float) -> tuple[Floats, Floats]:
     )
 
 
-def correlate_evenly(white: Floats, correlation: float) -> Floats:
+def correlate_agents(white: Floats, correlation: float) -> Floats:
     """Samples (..., N, 3) with the same correlation between any two agents, from white samples (..., N + 1, 3)."""
     own, common = white[..., :-1, :], white[..., -1:, :]
     return math.sqrt(1.0 - correlation) * own + math.sqrt(correlation) * common

@@ -79,12 +79,12 @@ def check_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
         ((), _all_obstacle_rules),
         ((), _all_area_rules),
         (("formations",), formations.formation_rules),
-        ((), _touching_pair_rules),
+        ((), _touching_count_rules),
         ((), phases.phase_rules),
         (("disturbances",), disturbances.disturbance_rules),
         (("network",), network.network_rules),
         ((), losses.loss_rules),
-        (("disturbances",), disturbances.disturbance_memory_rules),
+        (("disturbances",), disturbances.disturbance_storage_rules),
         ((), vehicles.vehicle_flight_rules),
         (("agents", "fixed"), _fixed_agent_rules),
         ((), avoidance.avoidance_rules),
@@ -139,14 +139,14 @@ def _validate_tables(m: Draft) -> None:
         if key in m.data:
             data = m.data[key]
             if key == "agents":
-                data = vehicles.fill_agents_table(m, _fill_start_points(m, data))
+                data = vehicles.fill_agents_table(m, _replace_start_shape(m, data))
             part = None if data is None else m.validate(kind, data, (key,))
             m.parts |= {} if part is None else {key: part}
     if "agents" not in m.data:
         m.add(("agents",), "is missing", "add a table [agents] with mass and position")
 
 
-def _fill_start_points(m: Draft, agents: Any) -> Any:
+def _replace_start_shape(m: Draft, agents: Any) -> Any:
     """Return [agents] with a shape of `position` replaced by its points; None if the shape has errors."""
     path, position = ("agents", "position"), look_up(agents, ("position",))
     if isinstance(position, str):
@@ -225,7 +225,7 @@ def _fixed_agent_rules(m: Draft) -> Breaches:
             yield Breach((), problem, remedy)
 
 
-def _touching_pair_rules(m: Draft) -> Breaches:
+def _touching_count_rules(m: Draft) -> Breaches:
     """No radii so large that a list of all touching pairs would fill memory."""
     n = m.n
     if m.findings or n is None or n * (n - 1) // 2 <= bounds.TOUCHING:

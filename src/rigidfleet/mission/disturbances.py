@@ -100,7 +100,7 @@ def _gust_rules(m: Draft, gusts: Gusts, wind: bool) -> Breaches:
         yield Breach("correlation_length", problem, remedy)
 
 
-def disturbance_memory_rules(m: Draft) -> Breaches:
+def disturbance_storage_rules(m: Draft) -> Breaches:
     """Tables of gusts and noise fit into memory."""
     d: Disturbances | None = m.disturbances
     if d is None or m.end is None or m.n is None or m.findings:

@@ -83,7 +83,7 @@ def draft(
     slots = shapes.slots(shape, list(size), n)
     nearest = float(proximity.nearest(slots).min()) if n > 1 else SIZE
     radius = min(RADIUS, nearest / 4)
-    start, below = _start_positions(slots, min(_APART, nearest))
+    start, below = _starts_below_slots(slots, min(_APART, nearest))
     low = float(-slots[:, 2].min()) + radius
     height = max(5.0, math.ceil(np.ptp(slots[:, 2]) + 3.0))
     if waypoints is None:
@@ -100,7 +100,7 @@ def draft(
     if not below:  # some agents cross the whole shape
         way = float(np.linalg.norm(np.ptp(np.vstack([slots, start - centre]), axis=0)))
     blend = max(4, blend_time(way))
-    climb, flights = _flight_duration(aloft - centre), _waypoint_durations(aloft, waypoints)
+    climb, flights = _rest_to_rest_seconds(aloft - centre), _waypoint_durations(aloft, waypoints)
     lasts = climb + blend + _SETTLE + sum(time for _, time in flights) + _HOLD
     limit = math.ceil(LIFT * mass * 9.81) if thrust_limit is None else thrust_limit
     extent = json.dumps([float(x) for x in size]) if len(size) > 1 else f"{size[0]:g}"
@@ -136,7 +136,7 @@ def agents_for(shape: str) -> int:
     return usual.get(shape, taken.start)
 
 
-def _start_positions(slots: Floats, apart: float) -> tuple[Floats, bool]:
+def _starts_below_slots(slots: Floats, apart: float) -> tuple[Floats, bool]:
     """Return start positions (N, 3) [m] on the ground, and whether each is below its slot.
 
     Where slots lie above each other, agents start on a grid, or few on a line.
@@ -169,12 +169,12 @@ def _waypoint_durations(at: Floats, waypoints: Sequence[Sequence[float]]) -> lis
     flights = []
     for waypoint in waypoints:
         to = np.asarray(waypoint, dtype=float)
-        flights.append((_toml_row(to), _flight_duration(to - at)))
+        flights.append((_toml_row(to), _rest_to_rest_seconds(to - at)))
         at = to
     return flights
 
 
-def _flight_duration(way: Floats) -> int:
+def _rest_to_rest_seconds(way: Floats) -> int:
     """Duration [s] of a rest-to-rest flight by a vector (3,) [m] that keeps to `_SPEED` and `_ACCELERATION`."""
     return max(4, blend_time(float(np.linalg.norm(way))))
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from rigidfleet._common.renamed import with_earlier_names
+from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.foreign.curves import rows_to_curve
 from rigidfleet.math.piecewise import Piecewise, stack_ways
 from rigidfleet.mission import values
@@ -31,7 +31,7 @@ class Settle(Part):
     timeout: values.Time = key("time after which the mission fails [s]", 60.0)
 
 
-@with_earlier_names(
+@with_earlier_members(
     led="follows_curves",
     spelled="flown_as_written",
     ended="keys_if_ended",
@@ -210,7 +210,7 @@ class Attitude(Part):
         return self.roll_deg, self.pitch_deg, self.yaw_deg
 
 
-@with_earlier_names(aligned="fits_slots")
+@with_earlier_members(aligned="fits_slots")
 class Shaping(AnyPhase):
     """A phase that changes the formation."""
 
@@ -418,7 +418,7 @@ class Brake(Arriving):
     kind: Literal["brake"] = required_key("come to rest where braking leads")
 
 
-@with_earlier_names(meets="commanded_at_arrival", each="has_way_per_vehicle")
+@with_earlier_members(meets="commanded_at_arrival", each="has_way_per_vehicle")
 class Vertical(Arriving):
     """A phase that leads vehicles straight up or down: all together, some of them, or one group after another."""
 

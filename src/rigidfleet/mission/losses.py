@@ -58,11 +58,11 @@ def loss_rules(m: Draft) -> Breaches:
     if d.hold_until is not None and d.hold_until <= first:
         problem = f"is not after the first loss at {first:g} s"
         yield Breach((_TABLE, "hold_until"), problem, "give a later time or remove it")
-    yield from _slot_tracking_rules(m, first, "loss", "brake", "on_loss = 'continue'")
+    yield from _required_tracking_rules(m, first, "loss", "brake", "on_loss = 'continue'")
     if d.on_loss == "land":
         if not grounded:
             yield Breach((_TABLE, "on_loss"), *_NO_GROUND)
-        yield from _landing_rules(m, d, m.n, first)
+        yield from _level_landing_rules(m, d, m.n, first)
 
 
 def _abort_rules(m: Draft) -> Breaches:
@@ -77,10 +77,10 @@ def _abort_rules(m: Draft) -> Breaches:
         within = f"after the start and before the end of the mission at {m.end:g} s"
         problem = f"and the reaction of {options.reaction:g} s are not {within}"
         yield Breach(("abort", "at"), problem, "give another time or remove it")
-    yield from _slot_tracking_rules(m, begins, "abort", "slow down", "abort at another time")
+    yield from _required_tracking_rules(m, begins, "abort", "slow down", "abort at another time")
 
 
-def _slot_tracking_rules(m: Draft, when: float, what: str, does: str, other: str) -> Breaches:
+def _required_tracking_rules(m: Draft, when: float, what: str, does: str, other: str) -> Breaches:
     """Slots are tracked in what may be under way at a loss or abort at a time [s]; words of it, and another remedy."""
     for k, p in phases_under_way(m.phases, when):
         if p.control != "tracking":
@@ -144,7 +144,7 @@ def phases_under_way(phases: Sequence[AnyPhase], t: float) -> Iterator[tuple[int
             yield k, p
 
 
-def _formations_under_way(phases: Sequence[AnyPhase], t: float) -> list[str | None]:
+def _possible_formations(phases: Sequence[AnyPhase], t: float) -> list[str | None]:
     """Formations that may be held at a time [s], each once; None: the places of the start."""
     held: dict[str | None, None] = {}
     for k, _ in phases_under_way(phases, t):
@@ -153,7 +153,7 @@ def _formations_under_way(phases: Sequence[AnyPhase], t: float) -> list[str | No
     return list(held)
 
 
-def _landing_rules(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
+def _level_landing_rules(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
     """Vehicles of a formation that lands reach the ground together."""
     forms, radius, name = m.formations, m.agents.radius, d.landing_formation
     if name is not None:
@@ -168,7 +168,7 @@ def _landing_rules(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
             remedy = "name a level formation, such as a line or a square"
             yield Breach(where, f"cannot land: {words}", remedy)
         return
-    for one in _formations_under_way(m.phases, first):
+    for one in _possible_formations(m.phases, first):
         points = np.array(m.agents.position) if one is None else forms[one].slot_array(n)
         if points is None:
             continue  # distances alone cannot be tracked, which is another finding

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from pydantic import PrivateAttr
 
 from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
-from rigidfleet._common.renamed import with_earlier_names
+from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet._common.text import agent_names, first_few
 from rigidfleet._common.toml import to_toml, to_toml_data
 from rigidfleet.errors import wrong_type
@@ -25,7 +25,7 @@ from rigidfleet.math.lqr import double_integrator_gains
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission.changes import add_scaled_formations, split_shared_formations
 from rigidfleet.mission.check import check_parts, default_tables
-from rigidfleet.mission.files import digest_lines
+from rigidfleet.mission.files import lines_with_digests
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
 from rigidfleet.mission.phases import latest_end_of_phases
@@ -84,7 +84,7 @@ def _compute_once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
 _STANDING = 0.5
 
 
-@with_earlier_names(linked="has_link", free_attitude="leaves_attitude_free")
+@with_earlier_members(linked="has_link", free_attitude="leaves_attitude_free")
 class Mission(Contents, Shown):
     """A checked mission. Create one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`.
 
@@ -247,7 +247,7 @@ class Mission(Contents, Shown):
     @property
     def file_digests_text(self) -> str:
         """What its text tells of the files that were read: lines with their digests."""
-        return self._about or digest_lines(self._text)
+        return self._about or lines_with_digests(self._text)
 
     @property
     def origin(self) -> str:

@@ -41,7 +41,7 @@ class Solid(Part):
         return None
 
     @property
-    def motion(self) -> tuple[Any, Any]:
+    def timed_path(self) -> tuple[Any, Any]:
         """Displacements (W, 3) [m] and their times (W,) [s]; empty if the obstacle does not move."""
         return (), ()
 
@@ -59,7 +59,7 @@ class Solid(Part):
         ValueError
             The points of a hull lie in a plane.
         """
-        ways, times = self.motion
+        ways, times = self.timed_path
         return records.one_solid(self.form, times, ways, self.lifetime)
 
 
@@ -80,14 +80,14 @@ class Moving(Solid):
     )
 
     @property
-    def motion(self) -> tuple[Any, Any]:
+    def timed_path(self) -> tuple[Any, Any]:
         """Displacements (W, 3) [m] and their times (W,) [s]."""
         if self.velocity is not None and any(self.velocity):
             return np.outer([0.0, _EVER], self.velocity), np.array([0.0, _EVER])
         if self.waypoints is None:
             still = np.isfinite(self.lifetime).any()  # one that appears counts as one that moves
             return (np.zeros((1, 3)), np.zeros(1)) if still else ((), ())
-        return np.array(self.waypoints) - self.centre_of_form, np.array(self.times)
+        return np.array(self.waypoints) - self.undisplaced_centre, np.array(self.times)
 
     @property
     def lifetime(self) -> tuple[float, float]:
@@ -99,7 +99,7 @@ class Moving(Solid):
         )
 
     @property
-    def centre_of_form(self) -> Any:
+    def undisplaced_centre(self) -> Any:
         """The centre (3,) [m] that waypoints lead: where the other keys place the obstacle."""
         return self.form.origin
 
@@ -117,7 +117,7 @@ class Box(Moving):
     @property
     def box_bounds(self) -> tuple[float, ...] | None:
         """Lowest and highest corner (6,) [m]; None if the box is turned or moves."""
-        if self.is_turned or len(self.motion[1]):
+        if self.is_turned or len(self.timed_path[1]):
             return None
         return (*self.min, *self.max)
 
@@ -238,7 +238,7 @@ KINDS: dict[str, type[Part]] = models_by_kind(Obstacle)
 
 def is_ground(thing: Obstacle) -> bool:
     """Whether an obstacle counts as ground: a ground, and terrain and boxes that are no zones and at rest."""
-    firm = isinstance(thing, Heights | Box) and not thing.zone and not len(thing.motion[1])
+    firm = isinstance(thing, Heights | Box) and not thing.zone and not len(thing.timed_path[1])
     return firm or isinstance(thing, Ground)
 
 

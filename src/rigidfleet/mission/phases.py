@@ -63,7 +63,7 @@ def _check_phases(m: Draft, phases: Written) -> None:
     """Check phases together, then each with what it needs."""
     lengths: Lengths = [None] * len(phases)
     m.record_breaches(("phases",), _phase_name_rules(phases))
-    m.record_breaches((), _phase_time_rules(m, phases, lengths))
+    m.record_breaches((), _phase_ending_rules(m, phases, lengths))
     for k, p in enumerate(phases):
         if p is not None:
             path = ("phases", k)
@@ -122,7 +122,7 @@ def _phase_name_rules(phases: Written) -> Breaches:
             yield Breach((k, "name"), problem, "give each phase its own name", p.name)
 
 
-def _phase_time_rules(m: Draft, phases: Written, lengths: Lengths) -> Breaches:
+def _phase_ending_rules(m: Draft, phases: Written, lengths: Lengths) -> Breaches:
     """Each phase has one ending, and ends increase; notes the greatest ``lengths`` of phases."""
     first: float | None = 0.0  # earliest and latest start of the phase; None if unknown
     last: float | None = 0.0
@@ -451,7 +451,7 @@ def _formation_use_rules(m: Draft, phases: Written) -> Breaches:
                 remedy = "remove it, give the formation slots, or command an attitude by yaw_deg"
                 yield Breach((*path, "attitude"), problem, remedy)
             if m.n is not None and form is not None and has_no_findings(m, shaping.formation):
-                yield from _blend_rules(shaping, form, m.n, path)
+                yield from _slot_blend_rules(shaping, form, m.n, path)
             held = shaping.formation
         form = forms.get(held) if held else None
         tracked = p.control == "tracking" and m.is_valid(path, "control")
@@ -475,7 +475,7 @@ def _formation_existence_rules(m: Draft, name: str, *where: str | int) -> Breach
         yield Breach(where, "there is no such formation", suggest(name, known) or names, name)
 
 
-def _blend_rules(p: Shaping, form: Formation, n: int, path: Keys) -> Breaches:
+def _slot_blend_rules(p: Shaping, form: Formation, n: int, path: Keys) -> Breaches:
     """A formation can be reached by blending slots: it has slots, and distances that agree with them."""
     if p.reference != "shape":
         return

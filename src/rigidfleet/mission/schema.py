@@ -271,9 +271,9 @@ class Constraint(Part):
         "fade out smoothly",
         1e-3,
     )
-    deformation_damping: Annotated[float, Strict(), values.number_from_zero_field(bounds.GAIN)] = (
-        key("damping of deformation velocities while no slots are tracked [1/s], >= 0", 1.0)
-    )
+    deformation_damping: Annotated[
+        float, Strict(), values.nonnegative_number_field(bounds.GAIN)
+    ] = key("damping of deformation velocities while no slots are tracked [1/s], >= 0", 1.0)
 
     @property
     def settling_time(self) -> float | None:
@@ -307,7 +307,7 @@ class Lqr(Regulator):
 
     @model_validator(mode="before")
     @classmethod
-    def _inherit_weights(cls, data: Any) -> Any:
+    def _fill_attitude_weights(cls, data: Any) -> Any:
         if not (isinstance(data, dict) and isinstance(data.get("attitude", {}), dict)):
             return data
         own = {key: value for key, value in data.items() if key in Regulator.model_fields}
@@ -319,7 +319,7 @@ class Tracking(Part):
 
     Q: values.Weights = key("weights [position error, velocity error], the first > 0", (4.0, 4.0))
     R: values.Cost = key("weight of the acceleration, > 0", 1.0)
-    integral: Annotated[float, Strict(), values.number_from_zero_field(bounds.GAIN)] = key(
+    integral: Annotated[float, Strict(), values.nonnegative_number_field(bounds.GAIN)] = key(
         "gain of the integral of the position error [1/s^3], >= 0; frozen while a vehicle saturates; only "
         "with [vehicles]",
         0.0,
@@ -766,7 +766,7 @@ class MissionHeader(Part):
         "more of a distance above each other than beside",
         1.0,
     )
-    gravity: Annotated[float, Strict(), values.number_from_zero_field(bounds.ACCELERATION)] = key(
+    gravity: Annotated[float, Strict(), values.nonnegative_number_field(bounds.ACCELERATION)] = key(
         "gravity [m/s^2], >= 0", 9.81
     )
     output_step: values.Time = key("time between samples of the result [s]", 0.05)

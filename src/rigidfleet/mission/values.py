@@ -32,25 +32,25 @@ def _positive_number_field(bound: bounds.Bound) -> Any:
     return Field(ge=bound.least, le=bound.most)
 
 
-def number_from_zero_field(bound: bounds.Bound) -> Any:
+def nonnegative_number_field(bound: bounds.Bound) -> Any:
     """A number from zero up to the bound."""
     return Field(ge=0, le=bound.most)
 
 
 Coordinate = Annotated[float, Strict(), signed_number_field(bounds.LENGTH)]
 Length = Annotated[float, Strict(), _positive_number_field(bounds.LENGTH)]
-LengthOrZero = Annotated[float, Strict(), number_from_zero_field(bounds.LENGTH)]
+LengthOrZero = Annotated[float, Strict(), nonnegative_number_field(bounds.LENGTH)]
 Time = Annotated[float, Strict(), _positive_number_field(bounds.TIME)]
 #: A time of the mission, from its start on.
-Seconds = Annotated[float, Strict(), number_from_zero_field(bounds.TIME)]
+Seconds = Annotated[float, Strict(), nonnegative_number_field(bounds.TIME)]
 Speed = Annotated[float, Strict(), _positive_number_field(bounds.SPEED)]
-Spread = Annotated[float, Strict(), number_from_zero_field(bounds.SPEED)]
+Spread = Annotated[float, Strict(), nonnegative_number_field(bounds.SPEED)]
 Acceleration = Annotated[float, Strict(), _positive_number_field(bounds.ACCELERATION)]
 Jerk = Annotated[float, Strict(), _positive_number_field(bounds.JERK)]
 Mass = Annotated[float, Strict(), _positive_number_field(bounds.MASS)]
 Angle = Annotated[float, Strict(), signed_number_field(bounds.ANGLE)]
 Gain = Annotated[float, Strict(), signed_number_field(bounds.GAIN)]
-Weight = Annotated[float, Strict(), number_from_zero_field(bounds.WEIGHT)]
+Weight = Annotated[float, Strict(), nonnegative_number_field(bounds.WEIGHT)]
 Cost = Annotated[float, Strict(), _positive_number_field(bounds.WEIGHT)]
 Tolerance = Annotated[float, Strict(), _positive_number_field(bounds.TOLERANCE)]
 #: Infinity is allowed here; a later check rejects it with its own remedy.
@@ -64,21 +64,21 @@ _T = TypeVar("_T")
 _Other = TypeVar("_Other")
 
 
-def _list_or_one_tag(value: object) -> str:
+def _list_discriminator(value: object) -> str:
     return "list" if isinstance(value, list | tuple) else "one"
 
 
-def _word_or_one_tag(value: object) -> str:
+def _word_discriminator(value: object) -> str:
     return "word" if isinstance(value, str) else "one"
 
 
 #: One value, or a list in its place; one value, or as many as there are agents; a value, or a word in its place.
 _OneOrList = Annotated[
-    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("list")], Discriminator(_list_or_one_tag)
+    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("list")], Discriminator(_list_discriminator)
 ]
 _PerAgent = _OneOrList[_T, tuple[_T, ...]]
 _ValueOrWord = Annotated[
-    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("word")], Discriminator(_word_or_one_tag)
+    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("word")], Discriminator(_word_discriminator)
 ]
 _Two, _Three = (Field(min_length=n, max_length=n) for n in (2, 3))
 Vector = Annotated[tuple[Coordinate, ...], _Three]

@@ -45,7 +45,7 @@ from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg
 from rigidfleet.planning.limits import Limit, limits_of
 from rigidfleet.planning.reference import PhaseState, Pose, copy_with
-from rigidfleet.planning.vehicles import air_force
+from rigidfleet.planning.vehicles import airflow_force
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Greatest acceleration [m/s^2], jerk [m/s^3] and speed [m/s] of a vehicle on its way home, unless `limits` asks for
@@ -236,12 +236,12 @@ class Aborts:
     # -- the plan -----------------------------------------------------------------------------------------
 
     @property
-    def plan_end(self) -> float:
+    def mission_end(self) -> float:
         """When the plan ends [s]."""
         return self.legs[-1].end
 
     @property
-    def plan_lands(self) -> bool:
+    def mission_lands(self) -> bool:
         """Whether the plan ends on the ground."""
         return bool(self.legs[-1].phase.lands)
 
@@ -349,9 +349,9 @@ class Aborts:
         time, over = self._least_time_along(
             first, self.limits, lambda time: _path_clock(begins, time, _SLOWING)
         )
-        if begins + 0.5 * time >= self.plan_end and self.plan_lands:
+        if begins + 0.5 * time >= self.mission_end and self.mission_lands:
             # What goes on beyond the end goes on down.
-            clock = _path_clock(begins, max(self.plan_end - begins, _LEAST), _ON)
+            clock = _path_clock(begins, max(self.mission_end - begins, _LEAST), _ON)
             return self.step_by_clock("to its end", clock), ""
         problem, step = "", self.step_by_clock("slow down", _path_clock(begins, time, _SLOWING))
         if over.max(initial=0.0) > _KEPT:
@@ -393,9 +393,9 @@ class Aborts:
             return self.off
         v = way.states(np.linspace(0.0, way.time[-1], _LOOKS), 2)[1][:, who]
         d = mission.disturbances
-        push = air_force(mission, (np.zeros(3) if d is None else np.array(d.wind)) - v, who)
+        push = airflow_force(mission, (np.zeros(3) if d is None else np.array(d.wind)) - v, who)
         if mission.tracking.drag_feedforward:
-            push = push - air_force(mission, -v, who)
+            push = push - airflow_force(mission, -v, who)
         push = push / (mission.fleet.mass[who, None] * mission.tracking_gains[0])
         apart = np.linalg.norm(push - push.mean(axis=1, keepdims=True), axis=2)
         return self.off + 2.0 * _OVERSHOOT * float(apart.max())
@@ -496,13 +496,13 @@ class Aborts:
         """Ways home from farther and farther back along the plan, from a time along it where all rest at a time [s]."""
         for far in np.append(np.arange(_BACK, path, _BACK), path).tolist():
 
-            def clock(time: float, far: float = far) -> Piecewise:
+            def backward_clock(time: float, far: float = far) -> Piecewise:
                 return _path_clock(path, time, -far / time * _BLEND)
 
-            time, _ = self._least_time_along(_FASTEST * far, self.home_limits, clock)
+            time, _ = self._least_time_along(_FASTEST * far, self.home_limits, backward_clock)
             home = self.straight_ways_home(self.plan.at(np.array([path - far]))[0], begin + time)
             if home.way:
-                step = self.step_by_clock("back", clock(time))
+                step = self.step_by_clock("back", backward_clock(time))
                 if not self.obstruction_in_words(step, begin):
                     yield Home((step, *home.steps), f"back along the plan, and {home.way}")
 
@@ -541,7 +541,7 @@ class Aborts:
         p, q = r[left], goal[left]
         if way == "to any place":
             metric, goal = downwash_metric(_UP, self.below / self.apart), goal.copy()
-            q = self._free_landing_places(r, q)
+            q = self._places_clear_of_wrecks(r, q)
             goal[left] = q[assign_slots(p, q, turn=np.eye(3), metric=metric).order]
         if way == "by levels":
             height = _altitude_levels(self.apart + off, p, q) * (self.below + off)
@@ -555,7 +555,7 @@ class Aborts:
         above[left] += rise * _UP
         return [*stops, ("over the places", r, above), ("down", above, goal)]
 
-    def _free_landing_places(self, r: Floats, own: Floats) -> Floats:
+    def _places_clear_of_wrecks(self, r: Floats, own: Floats) -> Floats:
         """The own places (n, 3) of those left; where a lost vehicle lies on one, that of a lost one if it is free."""
         if not self.wrecked.size:
             return own
@@ -588,7 +588,7 @@ class Aborts:
 
     def all_aborts(self) -> Iterator[Abort]:
         """The abort of each `step` of the flight."""
-        end = self.plan_end - self.options.reaction
+        end = self.mission_end - self.options.reaction
         for k in range(1 + max(0, math.floor(end / self.options.step - 1e-9))):
             yield self.abort_at(k * self.options.step)
 
@@ -606,7 +606,7 @@ class Aborts:
             reason = f"only tracked slots can slow down, and '{phase.name}' tracks none"
             return Abort(ordered, begins, (), Home(reason=reason))
         step, problem = self.slow_down(begins)
-        if self.plan_lands and step.path is not None and step.path > self.plan_end - 1e-6:
+        if self.mission_lands and step.path is not None and step.path > self.mission_end - 1e-6:
             return Abort(ordered, begins, (step,), Home((), "lands as planned"))
         if problem := problem or self.obstruction_in_words(step, begins):
             return Abort(ordered, begins, (step,), Home(reason=problem))
@@ -620,13 +620,13 @@ class Aborts:
         stay[np.array(self.options.agents) - 1] = False
         alone = Aborts(self.mission, self.legs, stay | self.lost)
         alone.wrecked, alone.moves = self.wrecked, self.moves
-        if self.plan_lands:
-            alone.start = self.plan.at(np.array([self.plan_end]))[0]
+        if self.mission_lands:
+            alone.start = self.plan.at(np.array([self.mission_end]))[0]
         return alone
 
     def _abort_of_leavers(self, ordered: float) -> Abort:
         """Some vehicles go home, as soon as they come near no other one; the others fly the plan on."""
-        begins, end = ordered + self.options.reaction, self.plan_end
+        begins, end = ordered + self.options.reaction, self.mission_end
         who = self._aborts_of_leavers.left
         order = np.concatenate([who, np.setdiff1d(self.left, who)])
         problem = "there is no time left"
@@ -652,7 +652,7 @@ class Aborts:
 
     def _all_ways(self, begins: float, waits: float, steps: Sequence[Step]) -> Piecewise:
         """The ways from a time on [s] of those that wait so long and then fly steps, and of the others, by the plan."""
-        last = np.array([max(begins, self.plan_end - _TOUCHING), self.plan_end])
+        last = np.array([max(begins, self.mission_end - _TOUCHING), self.mission_end])
         states = self.plan.states(last, 4)
         states[1:, 1] = 0.0  # a landing ends with the speed at which it touches down
         ways = [Piecewise.hermite(last, states).shift_time(-last[0])]
@@ -677,7 +677,7 @@ class Aborts:
 
         left, (least, most, each) = self.left, _SAMPLED
         step = min(max(least, each * self.mission.n_agents), most)
-        time = np.arange(abort.begins, min(abort.rest_time, self.plan_end), step)
+        time = np.arange(abort.begins, min(abort.rest_time, self.mission_end), step)
         if len(left) < 2 or not len(time):
             return []
         on, others = self.plan.at(time)[:, left], abort.positions_at(time)[:, left]

@@ -75,20 +75,20 @@ class Detour:
         """The deviation after dt [s], if its second derivatives go linearly to those asked for (7,) within h [s]."""
         share = dt / h
 
-        def derivatives_at(x: Floats, end: Floats) -> Floats:
+        def derivatives_after_dt(x: Floats, end: Floats) -> Floats:
             value, rate, second = x
             bend = (end - second) * share
             place = value + dt * (rate + dt * (second / 2 + bend / 6))
             return np.array([place, rate + dt * (second + bend / 2), second + bend])
 
         # The rotation vector from Q, whose rates are those of the body as long as it is small
-        spin = derivatives_at(np.array([np.zeros(3), *self.omega]), accelerations[3:6])
+        spin = derivatives_after_dt(np.array([np.zeros(3), *self.omega]), accelerations[3:6])
         Q = att.dcm_from_rotation_vector(spin[0]).T @ self.Q
-        x = derivatives_at(self.x, accelerations[:3])
-        scale = derivatives_at(self.scale, accelerations[6])
+        x = derivatives_after_dt(self.x, accelerations[:3])
+        scale = derivatives_after_dt(self.scale, accelerations[6])
         return Detour(x, Q, spin[1:], scale)
 
-    def taylor_series(self) -> tuple[Floats, Floats, Floats]:
+    def similarity_series(self) -> tuple[Floats, Floats, Floats]:
         """Taylor series of displacement (3, 3), rotation (3, 3, 3), body to world, and scale (3,)."""
         # In the axes of Q, in which the derivative of the rates is the same.
         own = self.omega @ self.Q
@@ -145,7 +145,7 @@ def nearest_accelerations(
     return None if y is None else accelerations + np.linalg.solve(L.T, y)
 
 
-def scale_bound_rows(deviation: Detour) -> tuple[Floats, Floats]:
+def rows_bounding_scale(deviation: Detour) -> tuple[Floats, Floats]:
     """Rows (2, 7) and what they need (2,), so that the scale stays between its bounds."""
     value, rate, _ = deviation.scale
     rows, needed = np.zeros((2, 7)), np.zeros(2)

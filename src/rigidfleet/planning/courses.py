@@ -34,9 +34,9 @@ from rigidfleet.planning.body_trajectories import (
     as_motion,
     orbit_motion,
     regulated_motion,
-    rotation_to_pose,
     smooth_motion,
     stopping_motion,
+    turn_to_start,
 )
 from rigidfleet.planning.reference import PhaseState, Pose, copy_with, pose_at
 from rigidfleet.typing import Floats
@@ -154,7 +154,7 @@ def _vertical_course(mission: Mission, phase: Vertical, now: PhaseState, t_end: 
     arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
     up, v, lift = np.zeros(3), np.zeros(3), None
     if phase.has_way_per_vehicle:
-        rise, masses = climb_heights(mission, phase, now), mission.fleet.mass
+        rise, masses = climb_distances(mission, phase, now), mission.fleet.mass
         up[2] = masses @ rise / masses.sum()
         if np.ptp(rise) >= _LEVEL:
             travel = min(phase.travel or math.inf, t_end - now.t)
@@ -179,7 +179,7 @@ def _follow_course(mission: Mission, phase: Follow, now: PhaseState, t_end: floa
     knots, pieces = way.time * scale, way.pieces * scale ** -np.arange(float(way.pieces.shape[-1]))
     T1 = np.eye(3) if phase.turns_away else pose.T
     begin = np.concatenate(
-        [np.stack([pose.r, pose.v, pose.a, pose.jerk]), rotation_to_pose(pose, T1)], 1
+        [np.stack([pose.r, pose.v, pose.a, pose.jerk]), turn_to_start(pose, T1)], 1
     )
     place = pose.r + (slots @ pose.T if pieces.shape[1] > 1 else 0.0)
     off = float(np.linalg.norm(pieces[0, :, :3, 0] - place, axis=1).max()) / _START_TOLERANCES[0]
@@ -204,7 +204,7 @@ def _follow_course(mission: Mission, phase: Follow, now: PhaseState, t_end: floa
             turn = series.series_by_derivatives(np.stack([pose.omega, pose.alpha, pose.alpha_dot]))
             turn = series.rotation_series_from_rates(np.eye(3), turn).swapaxes(1, 2)
             start = series.product(series.series_by_derivatives(start), turn, np.matmul)
-            start, begin[1:, 3:] = series.derivatives(start), 0.0
+            start, begin[1:, 3:] = series.taylor_derivatives(start), 0.0
         own = Piecewise(knots, ways).start_from(start, fade)
         end = own.at(own.time[-1:])[0]
         lift = Lift(end - slots, length, now.t + own.time, np.ascontiguousarray(own.pieces))
@@ -269,7 +269,7 @@ def _trajectory_conflict_text(phase: Follow, now: PhaseState) -> str:
     return ""
 
 
-def climb_heights(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
+def climb_distances(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     """How far [m] each vehicle (N,) goes up from the pose to hold: to a height, or (down) to just above the ground."""
     (_, goal, slots), n = now.pose_goal_slots, mission.n_agents
     place, ground = goal.r[2] + slots @ goal.T[:, 2], _surface_heights_below(mission, now)

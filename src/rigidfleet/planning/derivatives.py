@@ -49,7 +49,7 @@ def slot_derivatives(
     `desired_agents` and `blend_slots`; at times (K,) [s] of a phase's problem with control "tracking". At a knot,
     the piece after it counts. With fewer ``orders``, the last ones are left out.
     """
-    derivatives = series.derivatives(
+    derivatives = series.taylor_derivatives(
         slot_taylor(reference, body_taylor(motion, time, orders), time)
     )
     return derivatives.transpose(3, 0, 2, 1)
@@ -197,7 +197,7 @@ def yaw_by_kind(body: tuple[Floats, Floats], slots: Floats, yaw: Yaw) -> Floats:
         away[0] += np.array(yaw.point)[:2, None, None]
         turned = series.angle_series(away[:, 1], away[:, 0])
     turned[0] = np.unwrap(turned[0])
-    angles[:] = series.derivatives(turned)
+    angles[:] = series.taylor_derivatives(turned)
     return angles
 
 
@@ -247,7 +247,7 @@ def _yaw_rate_terms(slots: Floats) -> tuple[Floats, Floats]:
 
     |v| - h . v becomes (|v|^2 - |v| h . v) / sqrt(|v|^2 + SLOW^2), which is smooth at rest.
     """
-    v, a, j = series.derivatives(slots[:4, :2])[1:]
+    v, a, j = series.taylor_derivatives(slots[:4, :2])[1:]
     vv, va = (v * v).sum(axis=0), (v * a).sum(axis=0)
     size, speed = vv + SLOW**2, np.sqrt(vv)
     root = np.sqrt(size)

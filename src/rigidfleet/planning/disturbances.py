@@ -70,7 +70,7 @@ def _gusts(mission: Mission, gusts: Gusts, wind: Floats, step: float) -> Floats:
             white[..., :n, :], _relative_places(mission), gusts.correlation_length
         )
     else:
-        white = turbulence.correlate_evenly(white, gusts.correlation or 0.0)
+        white = turbulence.correlate_agents(white, gusts.correlation or 0.0)
     u, sigma = np.empty(white[0].shape), gust_intensity(gusts, speed)
     if gusts.model == "first-order":
         assert gusts.time_scale is not None  # checked on entry

@@ -247,9 +247,9 @@ class Roadmap:
                 yield a, b, np.full(len(a), change.cost)
         for f in range(1, len(self.lattices)):
             for k, layer in enumerate(self.layers):
-                yield self._links_between_frames(k, layer, f)
+                yield self._links_between_lattices(k, layer, f)
 
-    def _links_between_frames(self, k: int, layer: Layer, f: int) -> tuple[Ints, Ints, Floats]:
+    def _links_between_lattices(self, k: int, layer: Layer, f: int) -> tuple[Ints, Ints, Floats]:
         """Straight ways of a layer between common places of the world's lattice and the nearest of another frame."""
         from scipy.spatial import KDTree
 

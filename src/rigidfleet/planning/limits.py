@@ -20,7 +20,7 @@ from rigidfleet.math.bernstein import SIZES
 from rigidfleet.mission import Mission
 from rigidfleet.mission.schema import Limits
 from rigidfleet.planning.derivatives import reference_of_agents, slot_derivatives
-from rigidfleet.planning.vehicles import air_force
+from rigidfleet.planning.vehicles import airflow_force
 from rigidfleet.typing import Floats, Ints
 
 #: Samples of a phase and of a blend, of a piece, and of a phase of many pieces in all.
@@ -74,7 +74,7 @@ def limits_of(
 
     def force_per_mass(x: Floats, who: Ints) -> Floats:
         """What a thrust gives per mass [m/s^2], against drag if vehicles leave a reserve."""
-        air = 0.0 if reserve is None else air_force(mission, -x[:, 1], who) / mass[who, None]
+        air = 0.0 if reserve is None else airflow_force(mission, -x[:, 1], who) / mass[who, None]
         return x[:, 2] + up - air
 
     def tilt(_: Quantity, x: Floats, who: Ints) -> Floats:

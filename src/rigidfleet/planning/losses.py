@@ -28,7 +28,7 @@ from rigidfleet.planning.abort import (
     shortest_time,
 )
 from rigidfleet.planning.clearance import CLOSE, clearance_to, speed_bounds
-from rigidfleet.planning.courses import climb_heights, height_above_landing
+from rigidfleet.planning.courses import climb_distances, height_above_landing
 from rigidfleet.planning.legs import Leg, depart, leg_from, leg_of, phase_spans
 from rigidfleet.planning.limits import use_of_limits
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase
@@ -135,7 +135,7 @@ def loss_legs(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg
     everyone = tuple(range(1, mission.n_agents + 1))
     land = partial(Land, kind="land", name="land (loss)")
     each = partial(land, agents=everyone)
-    ways = [(each, -float(climb_heights(mission, each(duration=1.0), now).min()))]
+    ways = [(each, -float(climb_distances(mission, each(duration=1.0), now).min()))]
     if shaped:  # together, unless something is below some
         ways.insert(0, (land, height_above_landing(mission, now)))
     for make, depth in ways:

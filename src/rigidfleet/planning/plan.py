@@ -266,7 +266,7 @@ def plan_phase(
         feedback=feedback,
         control=_control_of_phase(mission, phase, masses),
         disturbance=no_disturbance(masses) if disturbance is None else disturbance,
-        external=_limit_force_steps(external or External(), motion, reference),
+        external=_limit_integrator_step(external or External(), motion, reference),
     )  # fmt: skip
     if mission.agents.fixed:
         problem = with_fixed_agents(problem, np.array(mission.agents.fixed) - 1)
@@ -285,7 +285,7 @@ def plan_phase(
     return plan
 
 
-def _limit_force_steps(external: External, motion: Motion, reference: Reference) -> External:
+def _limit_integrator_step(external: External, motion: Motion, reference: Reference) -> External:
     """A user's force, if any, with steps of at most half the time for which any coordinate of a reference accelerates.
 
     Only after a rest or a uniform motion, where steps grow without bound: they could miss what comes between two.

@@ -95,8 +95,8 @@ class Pose:
 def pose_at(motion: Motion, t: float) -> Pose:
     """The pose of a reference motion at a time [s], with its acceleration and jerk."""
     cm, axes = (x[..., 0] for x in body_taylor(motion, np.array([t])))
-    r, v, a, jerk = series.derivatives(cm)[:4]
-    omega, alpha, alpha_dot = series.derivatives(series.body_rates_series(axes))[:3]
+    r, v, a, jerk = series.taylor_derivatives(cm)[:4]
+    omega, alpha, alpha_dot = series.taylor_derivatives(series.body_rates_series(axes))[:3]
     return Pose(r, v, axes[0].T, omega, a=a, jerk=jerk, alpha=alpha, alpha_dot=alpha_dot)
 
 

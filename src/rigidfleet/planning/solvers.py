@@ -89,7 +89,7 @@ def elimination_steps(n: int, edges: Ints) -> Ints | None:
     return steps if at == 0 else None
 
 
-def dissection_order(points: Floats, edges: Ints, leaf: int = 16) -> Ints:
+def agent_dissection_order(points: Floats, edges: Ints, leaf: int = 16) -> Ints:
     """Order (N,) to eliminate agents in: geometric nested dissection (George, 1973) of points (N, 3).
 
     Recursively: both halves across the longest extent, then the agents that separate them. Parts of ``leaf`` or fewer

@@ -143,7 +143,7 @@ def timed_leg(
     return leg_from(mission, vary(round(time, 6)), departure)
 
 
-def least_time(mission: Mission, leg: Leg) -> tuple[str, float | None]:
+def key_and_least_time(mission: Mission, leg: Leg) -> tuple[str, float | None]:
     """The key of a phase that sets the time of its motion, and its least value [s]; None if no time is enough.
 
     The least time keeps all limits of the mission, and is found to within 1 %.

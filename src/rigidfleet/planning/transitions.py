@@ -298,7 +298,7 @@ def _layer_slots(
             return None
     apart = 2.0 * float(radius.max()) + limit + limits.separation_allowance
     height = max(apart, 2.0 * float(radius.max()) + (limits.separation_below or 0.0))
-    level = height * _levels_of_agents(neighbours_on_ways(apart, p, q))
+    level = height * _flight_levels(neighbours_on_ways(apart, p, q))
     one, two = (np.column_stack([x[:, :2], level]) for x in (p, q))
     stops = [p, one, two, q]
     for (a, b), part in zip(pairwise(stops), _PARTS, strict=True):
@@ -314,7 +314,7 @@ def _layer_slots(
     return stops
 
 
-def _levels_of_agents(near: list[list[int]]) -> Floats:
+def _flight_levels(near: list[list[int]]) -> Floats:
     """Level (N,) of each agent, ... -1, 0, 1, ..., such that no two that are near each other are within a level."""
     colour = np.full(len(near), -1)
     for i in np.argsort([-len(others) for others in near], kind="stable").tolist():

@@ -17,7 +17,7 @@ from rigidfleet.kernel.clock_records import FASTEST, OFF, RATE, VehicleClocks, s
 from rigidfleet.kernel.mail import Links, no_network
 from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
 from rigidfleet.math import series
-from rigidfleet.math.margins import Lag, LoopGains, tracking_error_gain
+from rigidfleet.math.margins import Lag, LoopGains, reference_error_gain
 from rigidfleet.math.quadrotor import ROTORS
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import VehicleModel
@@ -66,7 +66,7 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
     # A force is held over each step: twenty of them meet a smooth pulse to 1 %
     longest = min(autopilot.step, _FORCED if max_step < math.inf else math.inf, max_step / 10.0)
     steps = max(1, math.ceil(1.0 / autopilot.rate / longest - 1e-9))
-    flight = fleet.ideal_flight(
+    flight = fleet.new_ideal_flight(
         fleet.quadrotor_arrays(made, mission.gravity),
         start=0.0,
         h=1.0 / (autopilot.rate * steps),
@@ -113,7 +113,7 @@ def vehicle_lags(mission: Mission) -> list[Lag]:
 
 
 def tracking_lag_times(mission: Mission) -> Floats:
-    """Times T (N,) [s] by which a vehicle leaves its reference at most (`margins.tracking_error_gain`); 0 for points.
+    """Times T (N,) [s] by which a vehicle leaves its reference at most (`margins.reference_error_gain`); 0 for points.
 
     Its acceleration differs by up to T times the reference's greatest jerk, its velocity by up to T times the greatest
     acceleration.
@@ -125,11 +125,11 @@ def tracking_lag_times(mission: Mission) -> Floats:
         if not model.point:
             left = _LEFT * max(model.linear_drag)
             drag = left if tracking.drag_feedforward else model.linear_drag[0]
-            times[i] = tracking_error_gain(lags[i], law, drag / model.mass)
+            times[i] = reference_error_gain(lags[i], law, drag / model.mass)
     return times
 
 
-def air_force(mission: Mission, u: Floats, who: Ints | slice = slice(None)) -> Floats:
+def airflow_force(mission: Mission, u: Floats, who: Ints | slice = slice(None)) -> Floats:
     """Drag and lift (..., N, 3) [N] of air that moves at u (..., N, 3) [m/s] past vehicles, level near hover."""
     models = mission.vehicle_models
     if models is None:
@@ -196,7 +196,7 @@ def network_of(mission: Mission) -> Links:
     net, n, rate = mission.network, mission.n_agents, mission.autopilot.rate
     if net is None:
         return no_network(n)
-    links, reverse = directed_links(mission.edges)
+    links, reverse = links_and_reverses(mission.edges)
     worsens, recovers = gilbert_transitions(net.loss, net.burst)
     every, jitter = max(1, round(rate / net.broadcast_rate(n))), round(net.jitter * rate)
     delay, silence = max(1, round(net.delay * rate)), max(1, round(net.silence * rate))
@@ -227,7 +227,7 @@ def network_of(mission: Mission) -> Links:
     )
 
 
-def directed_links(edges: Ints) -> tuple[Ints, Ints]:
+def links_and_reverses(edges: Ints) -> tuple[Ints, Ints]:
     """Links (L, 2) both ways along edges (m, 2), sorted, and of each (L,) the one that leads back."""
     links = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0).astype(np.int64)
     return links, np.lexsort(links.T)
@@ -340,7 +340,7 @@ class TickTables:
             # An ideal point has no attitude that goes ahead of its force.
             yaw, slots = self._yaw_slots(problem, ticks / self.rate, turn)
             if len(slots):
-                jerk, snap = self._force_rates(slots)
+                jerk, snap = self._desired_force_rates(slots)
         if self.compensated:
             path = _tick_rows(slots[:2].reshape(6, self.n, -1)) if len(slots) else self._path(ticks)
         noise_r = noise_v = np.zeros((0, self.n, 3))
@@ -391,9 +391,9 @@ class TickTables:
         )
         if known is not None:
             self._known = turn, *known
-        return _tick_rows(turned[..., 1:]), series.derivatives(slots[..., 1:])
+        return _tick_rows(turned[..., 1:]), series.taylor_derivatives(slots[..., 1:])
 
-    def _force_rates(self, x: Floats) -> tuple[Floats, Floats]:
+    def _desired_force_rates(self, x: Floats) -> tuple[Floats, Floats]:
         """Two derivatives (K, N, 3) of the desired force per mass, from those of the reference, (5, 3, N, K).
 
         Drag that is fed forward changes the force with the velocity; near level flight body axes are the world's.
@@ -441,10 +441,10 @@ def yaw_turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> YawTur
     if problem.control.kind != TRACKING:
         still = start * np.array([[1.0], [0.0]])
         return YawTurn(t, still, np.zeros_like(start))
-    return turn_along(problem.reference, problem.motion, t, yaw, start)
+    return yaw_turn(problem.reference, problem.motion, t, yaw, start)
 
 
-def turn_along(reference: Reference, motion: Motion, t: float, yaw: Yaw, start: Floats) -> YawTurn:
+def yaw_turn(reference: Reference, motion: Motion, t: float, yaw: Yaw, start: Floats) -> YawTurn:
     """`yaw_turn_from` while slots are tracked."""
     if yaw.kind == "along":
         return YawTurn(t, start, np.zeros_like(start))
@@ -471,10 +471,10 @@ def slots_and_yaw(
     turned[0] += turn.off[0, :, None]
     done = blend_taylor(time, turn.begun, _TURN_TIME)[:3]
     if yaw.kind != "formation":
-        turned -= series.derivatives(done)[:, None] * turn.off[0, :, None]
+        turned -= series.taylor_derivatives(done)[:, None] * turn.off[0, :, None]
     if turn.off[1].any():
         tau = np.stack([time - turn.begun, np.ones_like(time), np.zeros_like(time)])
-        fading = series.derivatives(tau - series.product(tau, done))
+        fading = series.taylor_derivatives(tau - series.product(tau, done))
         turned += fading[:, None] * turn.off[1, :, None]
     return slots, turned, None
 

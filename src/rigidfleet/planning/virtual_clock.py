@@ -46,7 +46,7 @@ class VirtualClock:
         return off <= _STEADY
 
     @property
-    def runs_in_real_time(self) -> bool:
+    def has_unit_rate(self) -> bool:
         """Whether it runs as real time does."""
         return self.target == 1.0 and self.rate == (1.0, 0.0, 0.0)
 
@@ -79,7 +79,7 @@ class VirtualClock:
 
     def advance(self, dt: float) -> float:
         """Run for dt [s]; returns by how much the delay has grown [s]."""
-        if self.runs_in_real_time:
+        if self.has_unit_rate:
             return 0.0
         progress, s, first, second = self.progress_in(dt).tolist()
         self.rate = min(max(s, 0.0), 1.0), first, second
@@ -89,7 +89,7 @@ class VirtualClock:
         self.delay += lost
         return lost
 
-    def time_of_progress(self, progress: float, dt: float) -> float:
+    def time_until_progress(self, progress: float, dt: float) -> float:
         """Time [s], at most dt, after which tau will have made a progress [s]."""
         low, high = 0.0, dt
         for _ in range(60):

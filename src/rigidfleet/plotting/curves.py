@@ -116,7 +116,7 @@ def _reference_handle(*values: Floats) -> list[Line2D]:
     return [st.legend_entry("reference", **st.REFERENCE)]
 
 
-def draw_distances(ax: Axes, result: Result) -> None:
+def draw_edge_lengths(ax: Axes, result: Result) -> None:
     """Lengths of the edges, and their references."""
     ax.set_ylabel("distance [m]")
     draw_edge_lines(ax, result, result.distance, linewidth=1.9)
@@ -144,7 +144,7 @@ def distances(result: Result) -> Figure:
     """Distances of the active edges, with their references (dashed)."""
     fig, axes = st.time_figure(result, "Distances between agents", 1, height=3.4)
     ax = axes[0, 0]
-    draw_distances(ax, result)
+    draw_edge_lengths(ax, result)
     handles = [*edge_handles(result), *_reference_handle(result.distance_reference)]
     st.draw_legend(ax, handles, "edge" if len(result.edges) <= SINGLE else "")
     return fig
@@ -287,7 +287,7 @@ def inputs(result: Result) -> Figure:
         panel = Panel(below, result, result.thrust, "N", result.extreme("thrust"))
         panel.leave_out_final_peak()
         _widen_limits(below, min(0.1, 0.1 * peak_before_breakdown(result, result.thrust)))
-        panel.mark_extremes()
+        panel.mark_peak()
     st.draw_agents_legend(above, result.n_agents)
     return fig
 
@@ -310,7 +310,7 @@ def constraint_force(result: Result) -> Figure:
         draw_edge_lines(below, result, tension)
         below.axhline(0.0, color=st.FAINT, linewidth=0.6, zorder=1)
         edges.leave_out_final_peak()
-        edges.mark_extremes(always=False)
+        edges.mark_peak(always=False)
         st.draw_legend(below, edge_handles(result))
     return fig
 
@@ -371,7 +371,7 @@ def draw_constraint_error(ax: Axes, result: Result) -> list[Line2D]:
         ax.plot(result.time, np.fmax.reduce(size, axis=1), **look)
         handles.append(st.legend_entry("greatest |c| of an edge", **look))
     if not handles:
-        st.write_note(ax, "neither edges nor slots")
+        st.mark_empty(ax, "neither edges nor slots")
         return []
     ax.set_yscale("log", nonpositive="clip")
     seen = np.concatenate([size.ravel(), shape])
@@ -381,7 +381,7 @@ def draw_constraint_error(ax: Axes, result: Result) -> list[Line2D]:
         ax.set_ylim(max(_SMALLEST, 0.5 * float(large.min())), 3 * float(large.max()))
     else:
         ax.set_ylim(_SMALLEST, 1.0)
-        st.write_note(ax, f"only rounding errors: at most {seen.max():.1g} m")
+        st.mark_empty(ax, f"only rounding errors: at most {seen.max():.1g} m")
     return handles
 
 
@@ -417,7 +417,7 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
     values = np.where(np.isfinite(values), values, np.nan)
     if not np.isfinite(values).any():
         known = {"separation": result.n_agents == 1, "clearance": not result.mission.obstacles}
-        st.write_note(ax, nothing if known.get(name, True) else "unknown")
+        st.mark_empty(ax, nothing if known.get(name, True) else "unknown")
         if limit:
             ax.set_ylim(0.0, 1.4 * limit)
             st.draw_limit(ax, limit, f"limit {limit:g} m")
@@ -454,7 +454,7 @@ def _draw_planned_separation(ax: Axes, result: Result) -> None:
         st.write_above(ax, f"dotted: as planned, less {allowed:g} m")
 
 
-def _names_of_least_distances(result: Result) -> list[str]:
+def _least_distance_quantities(result: Result) -> list[str]:
     """Which least distances there are."""
     mission, several = result.mission, result.n_agents > 1
     there = {
@@ -466,10 +466,10 @@ def _names_of_least_distances(result: Result) -> list[str]:
     return [name for name in there if there[name]]
 
 
-@st.styled_figure(_names_of_least_distances, "only one agent, and nothing near it")
+@st.styled_figure(_least_distance_quantities, "only one agent, and nothing near it")
 def clearance(result: Result) -> Figure:
     """Distances between surfaces, with the limits."""
-    names = _names_of_least_distances(result)
+    names = _least_distance_quantities(result)
     height = 3.2 if len(names) == 1 else 1.8
     fig, axes = st.time_figure(result, "Clearance between surfaces", len(names), height=height)
     for name, ax in zip(names, axes[:, 0], strict=True):

@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def leaves_ground(result: Result) -> bool:
+def has_vertical_phase(result: Result) -> bool:
     """Whether vehicles take off or land in a phase of their own."""
     return any(phase.vertical is not None for phase in result.mission.phases)
 
 
-@st.styled_figure(leaves_ground)
+@st.styled_figure(has_vertical_phase)
 def operation(result: Result, agents: Sequence[int] = ()) -> Figure:
     """Altitude and speeds of all vehicles, their least separation, and their clearance to obstacles.
 

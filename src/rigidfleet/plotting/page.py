@@ -63,7 +63,7 @@ def summary(result: Result) -> Figure:
         ax.set_xlabel("time [s]")
     key = textwrap.fill(st.number_phases(over_time, result), 150, max_lines=3, placeholder=" …")
     if curves.has_edges(result):
-        curves.draw_distances(lengths, result)
+        curves.draw_edge_lengths(lengths, result)
     elif result.mission.obstacles and result.n_agents > 1:
         curves.draw_least(lengths, result, "separation")
     else:
@@ -77,7 +77,7 @@ def summary(result: Result) -> Figure:
         box, place = ax.yaxis.get_tightbbox(), ax.get_position()
         place.x0 += 0.0 if box is None else max(place.x0 - 0.046 - box.x0 / fig.bbox.width, 0.0)
         ax.set_position(place)
-    entries = space.trajectory_handles(result, view)
+    entries = space.trajectory_legend_entries(result, view)
     fig.legend(
         handles=entries, loc="lower center", ncols=math.ceil(len(entries) / (1 if len(entries) <= 10 else 2)),
         bbox_to_anchor=(0.5, 0.058), labelspacing=0.2,

@@ -65,7 +65,7 @@ class Panel:
     between: Extremum | None = None
     name: Callable[[int], str] = _agent_name
 
-    def mark_extremes(self, *, always: bool = True) -> None:
+    def mark_peak(self, *, always: bool = True) -> None:
         """Write the greatest value into the axes, and mark values off the scale at top and bottom.
 
         Without ``always``, only values off the scale are written.
@@ -104,7 +104,7 @@ class Panel:
         if not size.size or not np.isfinite(size[k, i]) or size[k, i] > IDLE:
             return False
         where = f", {self.name(int(i))} at {self.result.time[k]:.2f} s" if size[k, i] else ""
-        st.write_note(self.ax, f"only rounding errors: at most {size[k, i]:.3g} {self.unit}{where}")
+        st.mark_empty(self.ax, f"only rounding errors: at most {size[k, i]:.3g} {self.unit}{where}")
         return True
 
     def leave_out_final_peak(self) -> None:
@@ -117,7 +117,7 @@ class Panel:
     def draw(self, limits: Sequence[Limit] = (), *, always: bool = True) -> bool:
         """Draw each agent's values from zero, with their limits; return whether there was anything to draw.
 
-        The greatest is written; see `mark_extremes`.
+        The greatest is written; see `mark_peak`.
         """
         if self.note_if_rounding():
             return False
@@ -128,5 +128,5 @@ class Panel:
         top = max([peak, *(value for value, *_ in limits)])
         if top > 0.0:
             self.ax.set_ylim(-0.04 * top, 1.12 * top)
-        self.mark_extremes(always=always)
+        self.mark_peak(always=always)
         return True

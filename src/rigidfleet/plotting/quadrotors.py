@@ -126,7 +126,7 @@ def draw_with_limit(ax: Axes, result: Result, name: str, values: Floats | None =
     q, between = QUANTITIES[name], result.extreme(name)
     values = samples(result, name).values if values is None else values
     if not np.isfinite(values).any():
-        st.write_note(ax, q.nothing)
+        st.mark_empty(ax, q.nothing)
         return
     if between is not None:
         between = between._replace(value=q.scale * between.value, other=-1)
@@ -141,7 +141,7 @@ def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
 
     n, t = result.n_agents, result.time
     if not saturated.any():
-        st.write_note(ax, "no vehicle is asked for more than its rotors give")
+        st.mark_empty(ax, "no vehicle is asked for more than its rotors give")
         return
     for i, colour in enumerate(st.agent_colours(n)):
         last = np.append(t, t[-1])

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rigidfleet.mission import Mission
 
 
-def sketch_places(mission: Mission, name: str) -> tuple[Floats, bool]:
+def slots_or_layout(mission: Mission, name: str) -> tuple[Floats, bool]:
     """Positions (N, 3) [m] at which a formation's graph is drawn, and whether they are its slots.
 
     If the distances fix no shape, classical scaling of the shortest paths in the graph gives positions.
@@ -108,7 +108,7 @@ def draw_formation_sketch(
 
     A flat one is seen from its own side unless ``sideways``, lights from where they are meant to be.
     """
-    p, placed = sketch_places(mission, name)
+    p, placed = slots_or_layout(mission, name)
     masses = mission.fleet.mass
     p = p - masses @ p / masses.sum()
     edges, lengths = mission.formation_edges(name), mission.formation_distances(name)

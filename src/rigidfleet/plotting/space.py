@@ -303,7 +303,7 @@ def draw_trajectory_from_above(ax: Axes, result: Result, view: Scene) -> None:
         name.set_position((5 - 72 * beyond / ax.figure.dpi, 4))
 
 
-def trajectory_handles(result: Result, view: Scene) -> list[Any]:
+def trajectory_legend_entries(result: Result, view: Scene) -> list[Any]:
     """Legend entries of a trajectory."""
     waypoints = [st.legend_entry("waypoint", **_waypoint_look(result))] if view.waypoints else []
     if has_lights(result):
@@ -322,7 +322,7 @@ def trajectory(result: Result) -> Figure:
     fig = st.blank_figure(wide, 2.2 * wide if st.is_narrow() else 6.2)
     st.draw_flight_heading(fig, result, "Trajectory")
     view = trajectory_scene(result)
-    entries = trajectory_handles(result, view)
+    entries = trajectory_legend_entries(result, view)
     columns = max(1, min(len(entries), max(int(0.9 * wide), 2) if st.is_narrow() else 11))
     if st.is_narrow():  # the view from above stands below
         draw_trajectory_in_space(fig, result, view, (0.0, 0.5, 1.0, 0.44))

@@ -96,7 +96,7 @@ def styled_figure(
                     return draw(result, *more, **named)
                 name = getattr(draw, "__name__", "").replace("_", " ")
                 fig, axes = time_figure(result, name.capitalize(), 1)
-                write_note(axes[0, 0], nothing)
+                mark_empty(axes[0, 0], nothing)
                 return fig
 
         vars(draw_in_style)["there"] = there
@@ -292,7 +292,7 @@ def is_constant(values: Floats) -> bool:
     return not len(known) or float(np.ptp(known)) <= STILL
 
 
-def write_note(ax: Axes, words: str) -> None:
+def mark_empty(ax: Axes, words: str) -> None:
     """Write text in an axes that has nothing to show."""
     ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY)
     ax.tick_params(left=False, labelleft=False)

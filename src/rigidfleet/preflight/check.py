@@ -26,7 +26,7 @@ from rigidfleet.preflight.losses import loss_remarks
 from rigidfleet.preflight.margins import check_margins, margin_remarks
 from rigidfleet.preflight.network import check_network, network_remarks
 from rigidfleet.preflight.obstacles import boundary_remarks, obstacle_remarks
-from rigidfleet.preflight.offsets import offset_remarks
+from rigidfleet.preflight.offsets import steady_offset_remarks
 from rigidfleet.preflight.vehicles import check_vehicles, vehicle_remarks
 
 
@@ -81,7 +81,7 @@ def check(
         *vehicle_remarks(mission, preflight),
         *braking_remarks(mission),
         *trajectory.disturbance_remarks(mission, preflight),
-        *offset_remarks(mission, preflight),
+        *steady_offset_remarks(mission, preflight),
         *obstacle_remarks(mission, preflight),
         *boundary_remarks(mission, preflight),
         *trajectory.limit_remarks(mission, preflight),

@@ -59,7 +59,7 @@ def check_formations(
     left, checks = _FORMING, {}
     for k, name in enumerate(sorted(held, key=lambda name: held[name] == "nothing"), start=1):
         progress(f"formation '{name}', {k} of {len(held)}")
-        work = _estimated_check_time(mission, name, search=search)
+        work = _formation_check_time(mission, name, search=search)
         skipped = k > 1 and work > left
         left -= 0.0 if skipped else work
         check = _check_formation(mission, name, held[name], search=search, skipped=skipped)
@@ -67,7 +67,7 @@ def check_formations(
     return [checks[name] for name in mission.formations]
 
 
-def _estimated_check_time(mission: Mission, name: str, *, search: bool) -> float:
+def _formation_check_time(mission: Mission, name: str, *, search: bool) -> float:
     """Estimated time to check a formation [s]."""
     n, m = mission.n_agents, len(mission.formation_edges(name))
     if min(m, 3 * n) > DENSE:
@@ -102,7 +102,7 @@ def _check_formation(
     rigidity = analyse(slots, edges, masses=masses, dimension=space)
     check = replace(check, rigidity=rigidity)
     endless = rigidity.own.rigidity_class is RigidityClass.FLEXIBLE  # a continuum of other shapes
-    if not search or endless or contradiction_in_words(mission, name):
+    if not search or endless or slot_mismatch_in_words(mission, name):
         return check
     start, space = mission.agents.position, rigidity.own.space
     others = realisations(slots, edges, starts=STARTS, start=start, dimension=space)
@@ -120,7 +120,7 @@ def _holding_control(mission: Mission, name: str) -> _Held:
     return "tracking" if controls == {"tracking"} else "distances"
 
 
-def contradiction_in_words(mission: Mission, name: str) -> str:
+def slot_mismatch_in_words(mission: Mission, name: str) -> str:
     """Whose given distance differs most from that of their slots, and by how much; "" within tolerance."""
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
     if slots is None or not len(edges):
@@ -156,7 +156,7 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         if f.held_by == "nothing":
             continue
         alone = f.held_by == "distances"
-        if words := contradiction_in_words(mission, f.name):
+        if words := slot_mismatch_in_words(mission, f.name):
             yield _fails(words)
         r = f.rigidity
         if f.spectrum is not None:

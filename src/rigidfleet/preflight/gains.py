@@ -34,7 +34,7 @@ def gain_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     if all(phase.control == "tracking" for phase in phases) or not len(mission.edges):
         return
     if not g.stabilised:
-        yield from _drift_remarks(mission)
+        yield from _no_feedback_remarks(mission)
     elif g.settling_time_s is None:
         yield Remark(
             "note", "gains", "errors oscillate for more than a thousand cycles: raise alpha"
@@ -44,7 +44,7 @@ def gain_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         yield Remark("note", "gains", text)
 
 
-def _drift_remarks(mission: Mission) -> Iterator[Remark]:
+def _no_feedback_remarks(mission: Mission) -> Iterator[Remark]:
     """Remark that without feedback an error of a distance grows at its initial rate."""
     text = "there is no feedback (stabilisation = 'none'): errors of distances remain and grow at their initial rate"
     first = mission.phases[0].establishing

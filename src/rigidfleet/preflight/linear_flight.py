@@ -19,7 +19,7 @@ import numpy as np
 from rigidfleet.kernel.mail import FRESH, TOGETHER, UNDER_WAY
 from rigidfleet.math.margins import Lag, LoopGains
 from rigidfleet.math.rigid_body import rigid_motions
-from rigidfleet.planning.vehicles import directed_links
+from rigidfleet.planning.vehicles import links_and_reverses
 from rigidfleet.typing import Floats, Ints
 
 #: Of each coordinate: place, velocity, acceleration and two derivatives of it; those of a point end with the velocity.
@@ -78,7 +78,7 @@ class LinearFlight:
         tracks, iterated = law.control == "tracking", law.solver == "iterated"
         self.law = law if tracks else replace(law, k1=0.0, k2=0.0, ki=0.0)
         self.n, self.r, self.radio = len(r), r, radio
-        self.links, self.back = directed_links(edges)
+        self.links, self.back = links_and_reverses(edges)
         #: Whether nothing acts on motions of the whole formation.
         self.is_free = not (tracks or drag.any())
 
@@ -162,7 +162,7 @@ class LinearFlight:
             y[who, :, flight] = (inverses @ each[who, :, flight, None])[..., 0]
         return y[self._at]
 
-    def free_motions(self) -> Floats:
+    def rigid_states(self) -> Floats:
         """States (size, 2 t) in the places and with the steady velocities of the whole formation; nothing is heard."""
         Q = rigid_motions(self.r)
         still, moving = np.hstack([Q, 0.0 * Q]), np.hstack([0.0 * Q, Q])

@@ -59,10 +59,10 @@ def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         separation_remarks, downwash_remarks, obstacle_remarks, boundary_remarks, limit_remarks,
     ):  # fmt: skip
         yield from judge(mission, part)
-    yield from _wreck_remarks(Aborts(mission, legs, mission.lost_at <= first), part.planned_phases)
+    yield from _hit_remarks(Aborts(mission, legs, mission.lost_at <= first), part.planned_phases)
 
 
-def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
+def _hit_remarks(aborts: Aborts, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
     """Remarks on those left who hit a lost vehicle that falls or lies, at samples of the way after the loss."""
     left, radius = aborts.left, aborts.radius[aborts.left] - aborts.fall_uncertainty.max()
     for planned in way if aborts.wrecks else ():

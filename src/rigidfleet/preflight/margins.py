@@ -98,7 +98,7 @@ def formation_closed_loops(
         # On a way that ends, slow growth does no harm: weak shapes pass.
         growth = 1.0 / np.ptp(planned.time) if _changes_shape(planned) else GROWTH
         for r in _sampled_shapes(planned, phase):
-            key = (_place_in_words(planned), law, _shape_key(r))
+            key = (_formations_in_words(planned), law, _shape_key(r))
             if key in seen:
                 continue
             seen.add(key)
@@ -108,7 +108,7 @@ def formation_closed_loops(
                 skipped = True
                 continue
             work += size
-            laws.append(ClosedLoops(_place_in_words(planned), loops, law, growth))
+            laws.append(ClosedLoops(_formations_in_words(planned), loops, law, growth))
     return laws, skipped
 
 
@@ -130,7 +130,7 @@ def _changes_shape(planned: PlannedPhase) -> bool:
     return planned.path_ends is not None and leg.before.formation != leg.formation
 
 
-def _place_in_words(planned: PlannedPhase) -> str:
+def _formations_in_words(planned: PlannedPhase) -> str:
     before, after = planned.leg.before.formation, planned.leg.formation
     if not _changes_shape(planned):
         return f"'{after}'"

@@ -73,7 +73,7 @@ def check_network(
             flight.n / (radio.every * radio.tick), radio.tick, delay, latest, loss, own.loss, growing, unheard
         )  # fmt: skip
         each = (check, checks.get(name, check))
-        checks[name] = min(each, key=lambda f: (f.bears_network, f.delay_ticks, f.loss or 0.0))
+        checks[name] = min(each, key=lambda f: (f.tolerates_network, f.delay_ticks, f.loss or 0.0))
     return checks
 
 
@@ -134,7 +134,7 @@ def growth_at_delay(flight: LinearFlight, delay: int, accuracy: float = _FINE[0]
 
     if flight.is_free:
         # No vehicle feels them once all it holds is of them: until then, nobody pulls.
-        start = np.concatenate([x := flight.free_motions(), np.zeros((size - len(x), x.shape[1]))])
+        start = np.concatenate([x := flight.rigid_states(), np.zeros((size - len(x), x.shape[1]))])
         known = math.ceil((delay + every + flight.waits) / every) * every
         drift = np.linalg.qr(later(start, known, np.zeros((len(flight.links), x.shape[1]))))[0]
     # No class of its own: what scipy declares of this one is not how it is made.
@@ -271,7 +271,7 @@ def network_remarks(preflight: Preflight) -> Iterator[Remark]:
         if far := f.unheard_edges:
             text = f"'{name}': {far} edges are longer than the range of the network: nobody hears along them"
             yield Remark("note", "network", text)
-        if f.bears_network:
+        if f.tolerates_network:
             continue
         share, what = f.growing or 0.0, f"{100 * f.own_loss:.0f} % of its messages are lost"
         why, remedy = what, "lower network.loss, raise network.rate, or slow the constraint law"

@@ -89,7 +89,7 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
         names = [mission.obstacles[b].name for b in sorted(skipped)]
         text = f"to limit the time of the check, {names_with_verb(names)} skipped"
         yield Remark("note", "obstacle", text)
-    yield from _gap_remarks(mission, preflight, radius)
+    yield from _box_gap_remarks(mission, preflight, radius)
 
 
 def boundary_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -141,7 +141,7 @@ def _too_low_in_words(mission: Mission, preflight: Preflight, phase: str, ground
     )
 
 
-def _gap_remarks(mission: Mission, preflight: Preflight, radius: Floats) -> Iterator[Remark]:
+def _box_gap_remarks(mission: Mission, preflight: Preflight, radius: Floats) -> Iterator[Remark]:
     """Remarks on gaps between two boxes along the axes, at rest, through which the centre of mass passes.
 
     A gap lies between the nearest boxes on both sides of the centre of mass along an axis.

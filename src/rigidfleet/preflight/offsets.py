@@ -16,11 +16,11 @@ import numpy as np
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, rigid_body
-from rigidfleet.math.margins import constraint_share_of_input
+from rigidfleet.math.margins import constraint_share_matrix
 from rigidfleet.math.pid import matrix_exponential
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import PlannedPhase
-from rigidfleet.planning.vehicles import air_force, jet_speeds
+from rigidfleet.planning.vehicles import airflow_force, jet_speeds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
 from rigidfleet.preflight.margins import phase_gains
@@ -39,7 +39,7 @@ _SHAPES = 16
 _SMALL = 0.05
 
 
-def slot_offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
+def offsets_from_slots(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
     """Offsets (K, N, 3) [m] of the vehicles from their slots in each planned phase; zeros where none are tracked."""
     tracked = [planned.leg.phase.control == "tracking" for planned in way]
     pushes = [
@@ -76,10 +76,10 @@ def _unknown_accelerations(mission: Mission, planned: PlannedPhase) -> Floats:
     air = np.zeros(3) if d is None else np.array(d.wind)
     if d is not None and d.downwash and mission.n_agents <= STACKED:
         air = air - jet_speeds(mission, planned.position).sum(axis=2)[..., None] * up
-    force = air_force(mission, air - v)
+    force = airflow_force(mission, air - v)
     if mission.tracking.drag_feedforward:
-        known = air_force(mission, -v)
-        force -= known * [1.0, 1.0, 0.0] + air_force(mission, -v * up) * up
+        known = airflow_force(mission, -v)
+        force -= known * [1.0, 1.0, 0.0] + airflow_force(mission, -v * up) * up
     force -= (mission.true_mass[:, None] - mass) * (planned.acceleration + mission.gravity * up)
     return force / mass
 
@@ -98,13 +98,13 @@ def _offsets_with_edges(
     law, root = phase_gains(mission, planned.leg.phase, name), np.repeat(np.sqrt(masses), 3)
     law = replace(law, damping=_SMALL * law.damping)
     for part in np.array_split(np.arange(len(free)), _SHAPES):
-        S = constraint_share_of_input(planned.position[part[len(part) // 2]], edges, masses, law)
+        S = constraint_share_matrix(planned.position[part[len(part) // 2]], edges, masses, law)
         mixed = answers[part, 0] + (answers[part, 1] - answers[part, 0]) * root @ S / root
         free[part] = mixed.reshape(-1, *free.shape[1:])
     return free
 
 
-def offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
+def steady_offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on limits that steady offsets break: the flight will fail if nine tenths of an offset do.
 
     Where all of it does, a note. Limits that the plan itself breaks are told elsewhere. Gusts of two standard
@@ -117,7 +117,7 @@ def offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     if not mission.tracking.integral:
         remedy = f"; tracking has no integral: raise the first weight in tracking.Q (now {mission.tracking.Q[0]:g})"
         remedy += ", or set tracking.integral" if mission.vehicle_models is not None else ""
-    for planned, off in zip(way, slot_offsets(mission, way), strict=True):
+    for planned, off in zip(way, offsets_from_slots(mission, way), strict=True):
         far = float(np.linalg.norm(off, axis=2).max())
         if planned.leg.end > mission.first_loss or far < _LEAST:
             continue

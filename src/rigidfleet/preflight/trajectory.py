@@ -21,7 +21,7 @@ from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.limits import limits_of
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.reference import pose_at
-from rigidfleet.planning.vehicles import air_force
+from rigidfleet.planning.vehicles import airflow_force
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark
 from rigidfleet.rigidity import jacobian
@@ -179,7 +179,7 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
         force -= drag[:, None] * (wind - planned.velocity)
         needs.append(np.linalg.norm(force, axis=2) + gusts + noise)
     most = _force_nearest_to_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
-    steady = air_force(mission, np.tile(wind, (len(drag), 1)))
+    steady = airflow_force(mission, np.tile(wind, (len(drag), 1)))
     steady -= ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
     if mission.tracking.integral:
@@ -277,7 +277,7 @@ def limit_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
             # The limit that its reference breaks most, with the least time that keeps all.
             over = timing.broken_limits(mission, planned.leg)
             if over and (topic := over[0].limit.of.name_in_words) not in hopeless:
-                key, t = timing.least_time(mission, planned.leg)
+                key, t = timing.key_and_least_time(mission, planned.leg)
                 if t is None:
                     hopeless.add(topic)
                     remedy = f"no {key} of this phase keeps all limits"
@@ -285,7 +285,7 @@ def limit_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
                     remedy = f"the least {key} of this phase is {math.ceil(100 * t) / 100:.2f} s"
                 yield Remark("fails", topic, f"{timing.reached_in_words(over[0], phase)}; {remedy}")
         else:
-            yield from _sample_limit_remarks(mission, planned)
+            yield from _broken_limit_remarks(mission, planned)
         yield from geofence_remarks(mission, planned)
 
 
@@ -301,7 +301,7 @@ def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark
             yield Remark("fails" if planned.exact else "note", "geofence", text)
 
 
-def _sample_limit_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
+def _broken_limit_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
     """Remarks on speed, acceleration and thrust of samples beyond their limits."""
     x = np.stack([planned.position, planned.velocity, planned.acceleration], axis=1)
     for limit in limits_of(mission):

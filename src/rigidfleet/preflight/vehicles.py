@@ -15,12 +15,12 @@ from rigidfleet.mission.vehicles import VehicleModel
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.vehicles import (
-    air_force,
+    airflow_force,
     commanded_yaw,
     initial_yaw,
     jet_speeds,
     slots_and_yaw,
-    turn_along,
+    yaw_turn,
 )
 from rigidfleet.preflight.findings import Preflight, Remark, VehicleCheck
 from rigidfleet.typing import Floats
@@ -52,10 +52,10 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
         leg, n = planned.leg, mission.n_agents
         count = min(max(_SAMPLES, int((leg.end - leg.start) / _STEP) + 1), _MOST)
         time = np.linspace(leg.start, leg.end, max(11, min(count, _PLACES // n)))
-        turn = turn_along(leg.reference, leg.motion, leg.start, setting, angle)
+        turn = yaw_turn(leg.reference, leg.motion, leg.start, setting, angle)
         slots, turned, _ = slots_and_yaw(leg.reference, leg.motion, time, setting, turn)
         angle, yaw = turned[:2, :, -1], turned.transpose(2, 0, 1)
-        x = series.derivatives(slots).transpose(3, 0, 2, 1)
+        x = series.taylor_derivatives(slots).transpose(3, 0, 2, 1)
         for i, model in enumerate(models):
             if not model.point:
                 need = _needs_of_path(model, x[:, :, i], yaw[:, :, i], mission.gravity)
@@ -156,7 +156,7 @@ def _jet_remarks(mission: Mission, way: Sequence[PlannedPhase]) -> Iterator[Rema
         flow = jet_speeds(mission, planned.position)
         down = np.zeros((*flow.shape, 3))
         down[..., 2] = flow
-        push = air_force(mission, down.swapaxes(1, 2)).swapaxes(1, 2)[..., 2]
+        push = airflow_force(mission, down.swapaxes(1, 2)).swapaxes(1, 2)[..., 2]
         share = push / (mission.fleet.mass * mission.gravity)[:, None]
         k, i, j = np.unravel_index(int(share.argmax()), share.shape)
         if share[k, i, j] > worst[0]:

@@ -39,7 +39,7 @@ def brief_rows(
         ("Rehearsed", rehearsed or ["No drill belongs to this report."]),
         ("Aborted", abort or ["No way home belongs to this report."]),
         ("Fences and people", beside or ["The mission has neither."]),
-        ("Where things fall", _fall_sentences(result, falls)),
+        ("Where things fall", _fall_reach_sentences(result, falls)),
         ("Versions and digests", provenance_sentences(result)),
     ]
 
@@ -80,7 +80,7 @@ def _proof_sentences(result: Result, verdict: Verdict) -> list[str]:
     ]
 
 
-def _fall_sentences(result: Result, falls: Floats) -> list[str]:
+def _fall_reach_sentences(result: Result, falls: Floats) -> list[str]:
     """How far vehicles that fail are carried, at samples."""
     mission = result.mission
     if not np.isfinite(falls).any():

@@ -35,7 +35,7 @@ def _constraint_lines(mission: Mission) -> list[GainLine]:
         lines.append(("constraint force", "no feedback", "distance errors remain and grow"))
     else:
         gain = f"α = {c.alpha:.4g} /s, β = {c.beta:.4g} /s, γ = {c.gamma:.4g} /s³"
-        poles = ", ".join(_pole_text(s) for s in pid.poles(c.alpha, c.beta, c.gamma))
+        poles = ", ".join(_complex_text(s) for s in pid.poles(c.alpha, c.beta, c.gamma))
         lines += [
             ("constraint feedback", gain, "a distance error c obeys c‴ + 2α c″ + β² c′ + γ c = 0"),
             ("poles of the error", f"{poles} /s", "all have negative real parts: every error decays"),
@@ -113,7 +113,7 @@ def _behaviour_in_words(k1: float, k2: float) -> str:
     )
 
 
-def _pole_text(s: complex) -> str:
+def _complex_text(s: complex) -> str:
     if abs(s.imag) < 1e-9 * abs(s):
         return f"{s.real:.3g}"
     return f"{s.real:.3g} {'+' if s.imag > 0 else '−'} {abs(s.imag):.3g}i"

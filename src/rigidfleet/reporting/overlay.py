@@ -55,7 +55,7 @@ def svg_of_time_curves(flights: Sequence[Result], labels: Sequence[str]) -> byte
             worst = "least" if q.at_least else "greatest"
             ax.set_title(f"{worst} {q.name_in_words} [{display_unit(q.unit)}]")
             if not known:
-                st.write_note(ax, "nothing to show")
+                st.mark_empty(ax, "nothing to show")
             elif logarithmic:
                 ax.set_yscale("log", nonpositive="clip")
                 ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-12))

@@ -111,7 +111,7 @@ def netcdf_content(
         for name, kind in ATTRIBUTES.items():
             # Attributes can be text or numbers, but not dict, bool or None: those are stored as JSON.
             plain = kind if kind in (int, str) else to_json_text
-            file.attrs[_netcdf_attribute_name(name)] = plain(attributes[name])
+            file.attrs[_stored_attribute_name(name)] = plain(attributes[name])
         for name, names in labels.items():
             names_along = file.create_variable(name, (name,), text)
             if names:
@@ -157,7 +157,7 @@ def read_netcdf(path: Path, variables: Mapping[str, Variable]) -> dict[str, Any]
         made = reader.read_attribute(file, _MARK, int)
         refuse_format(path, "result", made, SCHEMA_VERSION, older="Fly the mission again")
         attributes = {
-            name: reader.read_attribute(file, _netcdf_attribute_name(name), kind)
+            name: reader.read_attribute(file, _stored_attribute_name(name), kind)
             for name, kind in ATTRIBUTES.items()
         }
         sizes = {dim: len(names) for dim, names in LABELS.items()}
@@ -165,7 +165,7 @@ def read_netcdf(path: Path, variables: Mapping[str, Variable]) -> dict[str, Any]
     return arrays | attributes | {"complete": bool(attributes["complete"])}
 
 
-def _netcdf_attribute_name(name: str) -> str:
+def _stored_attribute_name(name: str) -> str:
     """Name of an attribute in the file."""
     return "mission" if name == "mission_text" else name
 

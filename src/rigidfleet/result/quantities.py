@@ -92,7 +92,7 @@ def _motion_magnitudes(result: Result, q: Quantity) -> tuple[Floats, ...]:
     return (mask_lost(result, SIZES[q.way](x) if q.way else norms(x)),)
 
 
-def _separation_below(result: Result) -> tuple[Floats, Owner]:
+def _vertical_separation(result: Result) -> tuple[Floats, Owner]:
     """Least height (K,) [m] between two agents, one below the other."""
     least, pair = proximity.headroom(result.position, result.mission.agents.radius, result.left)
     return least, lambda k: pair[k]
@@ -162,7 +162,7 @@ def _with_edge_owners(result: Result, values: Floats) -> tuple[Floats, Owner]:
 #: Values of quantities at samples, with their owners where these are no single agents.
 SAMPLED: dict[str, Callable[[Result], tuple[Any, ...]]] = {
     **{q.name: partial(_motion_magnitudes, q=q) for q in MOTIONS},
-    "separation_below": _separation_below,
+    "separation_below": _vertical_separation,
     "lost": _distance_to_lost,
     "geofence": _distance_beyond_fence,
     **{name: partial(_boundary_distances, name=name) for name in ("fence", "soft_fence", "people")},

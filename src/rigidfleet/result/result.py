@@ -19,7 +19,7 @@ from rigidfleet._common.arguments import as_path
 from rigidfleet._common.facts import Fact, FactTable, Row, Sheet, Shown, table_of_worst_values
 from rigidfleet._common.files import write_file
 from rigidfleet._common.quantities import PLACES, quantity
-from rigidfleet._common.renamed import with_earlier_names
+from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.errors import MissionError, ResultError, wrong_type
 from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, netcdf_content, read_netcdf
 from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
@@ -52,7 +52,7 @@ def _installed_versions() -> dict[str, str]:
     return versions
 
 
-@with_earlier_names(evaluate="compute_lazy_values", motion="setpoints_at_samples")
+@with_earlier_members(evaluate="compute_lazy_values", motion="setpoints_at_samples")
 @dataclass(kw_only=True, eq=False, repr=False)
 class Result(Shown):
     """Record of a flight: the states of all vehicles, the forces on them, and the mission.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet._common.renamed import with_earlier_names
+from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.rigidity.framework import Flex, Framework, localised_flexes
@@ -32,7 +32,7 @@ _BARELY = 1e-3
 WHERE = ("point", "line", "plane", "space")
 
 
-@with_earlier_names(force="constraint_force_bound")
+@with_earlier_members(force="constraint_force_bound")
 @dataclass(frozen=True)
 class Rigidity:
     """Rigidity of a shape under the distances of some edges, and the motions they leave free.

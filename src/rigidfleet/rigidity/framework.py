@@ -145,7 +145,7 @@ def localised_flexes(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
             chosen.append(motion / np.linalg.norm(motion, axis=1).max())
         if len(chosen) == F.shape[1]:
             break
-    return _remove_common_parts(chosen)
+    return _subtract_smaller_motions(chosen)
 
 
 def _candidate_flexes(frame: Framework) -> Iterator[Floats]:
@@ -160,7 +160,7 @@ def _number_of_movers(motion: Floats) -> int:
     return int(np.count_nonzero(motion.any(axis=1)))
 
 
-def _remove_common_parts(motions: list[Floats]) -> list[tuple[tuple[int, ...], Floats]]:
+def _subtract_smaller_motions(motions: list[Floats]) -> list[tuple[tuple[int, ...], Floats]]:
     """Motions (N, d) with their moving agents, fewest first, without parts that fewer agents already have."""
     out: list[tuple[tuple[int, ...], Floats]] = []
     for motion in sorted(motions, key=_number_of_movers):

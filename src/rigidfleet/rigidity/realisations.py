@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet._common.renamed import with_earlier_names
+from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.rigidity.analysis import (
     RigidityClass,
     as_framework,
@@ -36,7 +36,7 @@ class Kind(StrEnum):
     COINCIDENT = "coincident"
 
 
-@with_earlier_names(found="starts")
+@with_earlier_members(found="starts")
 @dataclass(frozen=True)
 class Realisation:
     """A shape with the given distances.
@@ -73,7 +73,7 @@ class Realisation:
         }
 
 
-@with_earlier_names(found="shapes")
+@with_earlier_members(found="shapes")
 @dataclass(frozen=True)
 class Realisations:
     """Result of a search from many starts.

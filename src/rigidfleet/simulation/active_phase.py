@@ -116,7 +116,7 @@ class ActivePhase:
         """
         raise NotImplementedError
 
-    def lead_reference(self, *, by_law: bool) -> float:
+    def adapt_reference(self, *, by_law: bool) -> float:
         """Decide how to fly on, ``by_law`` or under a controller; returns until when that holds [s]."""
         return math.inf
 
@@ -163,7 +163,7 @@ class ActivePhase:
         """
         whole = t_end >= self.plan.t_end
         while self.t < (self.plan.t_end if whole else t_end):
-            decided = self.lead_reference(by_law=controller is None)
+            decided = self.adapt_reference(by_law=controller is None)
             end = min(decided, self.plan.t_end if whole else t_end)
             if controller is None or self.plan.phase.control != "tracking":
                 self._integrate(self.plan.problem, end)
@@ -176,14 +176,14 @@ class ActivePhase:
         while self.t < t_end:
             # Control instants are the start of the phase and multiples since, not the ends of its segments.
             if self.held is None or self.t >= start + self.control_calls / rate:
-                self.held = self._problem_under_controller(controller)
+                self.held = self._call_controller(controller)
                 # Instants that differ by a rounding error, far less than a millionth of a period, are one.
                 self.control_calls = (
                     max(self.control_calls, math.floor((self.t - start) * rate + 1e-6)) + 1
                 )
             self._integrate(self.held, min(start + self.control_calls / rate, t_end))
 
-    def _problem_under_controller(self, controller: Controller) -> Problem:
+    def _call_controller(self, controller: Controller) -> Problem:
         """The problem with what a user's controller asks for now: forces, or a command of vehicles."""
         self.drop_command()
         when = f"at t = {self.t:.3f} s"
@@ -244,7 +244,7 @@ class ActivePhase:
         """Raise errors of the multipliers' solver, or of the monitor's solver."""
         if self.solver is not None:
             self.solver.raise_pending_error()
-            self.solver.solver_for_thread.raise_pending_error()
+            self.solver.thread_solver.raise_pending_error()
 
     # -- inside -----------------------------------------------------------------------------------
 

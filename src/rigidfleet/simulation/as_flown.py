@@ -148,7 +148,7 @@ def _data_as_flown(
         # The assignment of agents to slots followed from phases that were not flown.
         data["assignment"] = "given"
         data["formations"] = {name: _formation_table(mission, name) for name in mission.formations}
-    data["phases"] = [_phase_table(*each) for each in zip(begun, records, strict=True)]
+    data["phases"] = [_phase_toml_table(*each) for each in zip(begun, records, strict=True)]
     if options := own.get("abort"):  # what followed from an order is among the phases
         data["abort"] = {key: x for key, x in options.items() if key != "at"}
     if disturbed := own.get("disturbances"):
@@ -163,7 +163,7 @@ def _data_as_flown(
     return data
 
 
-def _phase_table(phase: Phase, record: PhaseRecord) -> dict[str, Any]:
+def _phase_toml_table(phase: Phase, record: PhaseRecord) -> dict[str, Any]:
     """A phase as a mission file holds it, from its start to its actual end."""
     keys = phase.model_dump(mode="json", exclude_unset=True)
     for key in ("duration", "settle"):

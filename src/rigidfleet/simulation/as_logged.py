@@ -161,7 +161,7 @@ def _likely_flight(
     # Noise of a known size and an unknown course may be any of several; each gives ways of its own.
     unknown = _COURSES if estimate.words and estimate.source == "stated" else ()
     models = [smoothed, *(_smooth_ways(logs, noise._replace(tau=tau)) for tau in unknown)]
-    drawn = _deviations_of_draws(flown, models, late)
+    drawn = _random_deviations(flown, models, late)
     if plan is not None:
         few = slice(None, None, -(-len(flown.time) // _BANDS))
         place = np.linalg.norm(drawn[:, 0, few], axis=3).max(axis=0).round(6)
@@ -221,7 +221,7 @@ def _clock_offsets(alignment: Alignment, clock: Clock) -> Floats:
     return offsets
 
 
-def _deviations_of_draws(flown: Result, models: Sequence[Sequence[Smoothed]], late: Floats) -> Any:
+def _random_deviations(flown: Result, models: Sequence[Sequence[Smoothed]], late: Floats) -> Any:
     """By how much ways drawn differ from the likely one (S, 3, K, N, 3); ``late``: errors of clocks (N or 1,) [s]."""
     random, time = np.random.default_rng(0), flown.time + flown.statistics.get("clock", 0.0)
     count = int(np.clip(_KNOTS // sum(len(x.knots) for x in models[0]), _LEAST, _MOST))
@@ -231,7 +231,7 @@ def _deviations_of_draws(flown: Result, models: Sequence[Sequence[Smoothed]], la
         inside = flown.left[:, i]
         drawn = [model[i].draw(share, random) for model, share in zip(models, shares, strict=True)]
         points = np.concatenate(drawn, axis=2) - likely.points[..., None]
-        states = smoothing.spline_of_points(likely.knots, points).states(time[inside], 3)
+        states = smoothing.b_spline_curve(likely.knots, points).states(time[inside], 3)
         off[:, :, inside, i] = np.moveaxis(states, -1, 0)
     rates = np.stack([flown.velocity, np.nan_to_num(flown.acceleration)])
     for s, by in enumerate(late * random.standard_normal((count, len(late)))):
@@ -268,7 +268,7 @@ def replace_ways(plan: Result, planned: Piecewise, way: Piecewise, spans: list[A
             extremes = watch.end_phase() | fastest
         records.append(replace(record, extremes=extremes, settled=None, controller=None))
     watch.keep_only(np.ones(plan.n_agents, dtype=np.bool_))
-    watch.add_flight_extremes(records)
+    watch.add_extremes_to_phases(records)
     every = {name: getattr(plan, name) for name in _PLANNED}
     known: dict[str, Any] = {name: x[inside] for name, x in every.items() if x is not None}
     (r, v, a), slots = way.states(time, 3), planned.states(time, 3)[..., :3]

@@ -155,7 +155,7 @@ class _Flights:
         before = now.reference.values_of(plan.edges, _edge_lengths(self.r, plan.edges))
         sums = [self.integral.get(edge, np.zeros(count)) for edge in edges]
         y = np.column_stack([self.r.reshape(count, -1), self.v.reshape(count, -1), *sums])
-        places, options = _flight_of_each_lane(self.finished), self.mission.integrator
+        places, options = _flights_with_substitutes(self.finished), self.mission.integrator
         velocity = tolerance_of_velocity(options, now.r, problem.vehicles.m, law.beta, large=False)
         shared = batch.can_unroll(problem) if vectors is None else vectors
         ends = batch.fly_all(
@@ -201,7 +201,7 @@ def _starts(name: str, values: ArrayLike, agents: int) -> Floats:
     return starts
 
 
-def _flight_of_each_lane(finished: Bools) -> Ints:
+def _flights_with_substitutes(finished: Bools) -> Ints:
     """Flight in each place; a flight that is out leaves its place to a neighbour, so that all others keep theirs."""
     places = np.arange(len(finished))
     for k in np.flatnonzero(~finished):

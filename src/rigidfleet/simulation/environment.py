@@ -177,7 +177,7 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
     def _observations(self, active: ActivePhase) -> dict[str, Vector]:
         """Observations of all vehicles that fly."""
         assert isinstance(active, SampledPhase)
-        views = [view for view in active.views() if view is not None]
+        views = [view for view in active.views_of_laws() if view is not None]
         return {self.possible_agents[view.agent]: self.observation(view) for view in views}
 
     def _rewards(self, active: ActivePhase) -> dict[str, float]:

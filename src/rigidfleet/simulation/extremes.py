@@ -241,7 +241,7 @@ class CurveWatch:
         self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
         return extremes
 
-    def add_flight_extremes(self, phases: Sequence[PhaseRecord]) -> None:
+    def add_extremes_to_phases(self, phases: Sequence[PhaseRecord]) -> None:
         """Give the phases of a finished flight its first contacts, and its clearances in flight and on an obstacle."""
         extremes: dict[str, Extremum | None] = dict(self.touched)
         if self.solids is not None or len(self.boxes):

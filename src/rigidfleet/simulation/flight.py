@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet._common.renamed import with_earlier_names
+from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.errors import FlightError, MissionError, StoppedError, wrong_type
 from rigidfleet.kernel.avoidance import with_obstacles
 from rigidfleet.kernel.problem import TRACKING, External, Motion, workspace
@@ -187,7 +187,7 @@ def simulate(
     return flight.finish()
 
 
-@with_earlier_names(
+@with_earlier_members(
     arrive="end_phase_if_over", among="replace_obstacles", contact="deepest_contact"
 )
 class Flight:
@@ -579,7 +579,7 @@ class Flight:
             last = max(piece.phase for piece in pieces) + 1
             step = step or mission.output_step
             mission, phases = mission_as_flown(mission, flown[:last], phases[:last], step)
-        self._extremes.add_flight_extremes(phases)
+        self._extremes.add_extremes_to_phases(phases)
         evaluations, steps, rejected = self._count.tolist()
         statistics = {
             "evaluations": evaluations, "steps": steps, "rejected": rejected,

@@ -25,7 +25,7 @@ from rigidfleet.planning.body_layer import (
     greatest_point_acceleration,
     nearest_accelerations,
     rigid_motion_rows,
-    scale_bound_rows,
+    rows_bounding_scale,
 )
 from rigidfleet.planning.derivatives import body_taylor, slot_derivatives, slot_taylor
 from rigidfleet.planning.plan import PhasePlan
@@ -129,7 +129,7 @@ class Leader:
         accelerations = (
             self._detour_accels(t, a) if acts and self.settings.body else self.deviation.decay()
         )
-        if self.clock.runs_in_real_time and self.deviation.is_zero and not accelerations.any():
+        if self.clock.has_unit_rate and self.deviation.is_zero and not accelerations.any():
             self.now = None
             if not self.leads:
                 return None
@@ -236,7 +236,7 @@ class Leader:
             if progress <= 0.0:
                 return time
             if progress <= end - begun - lost:
-                return begun + clock.time_of_progress(progress, end - begun)
+                return begun + clock.time_until_progress(progress, end - begun)
             return time + lost
 
         plan = self.plan
@@ -255,7 +255,7 @@ class Leader:
         dt = [-_OVERLAP, h + _OVERLAP]
         left = motion.knots[-1] - (t - self.clock.delay)
         if 0.0 < left < self.clock.progress_in(h)[0]:
-            dt.insert(1, self.clock.time_of_progress(left, h))
+            dt.insert(1, self.clock.time_until_progress(left, h))
         times, dt = t + np.array(dt), np.repeat(dt, 2)[1:-1]  # both ends of each polynomial
         dt[1:-1:2] -= _BESIDE
         dt[2:-1:2] += _BESIDE
@@ -266,19 +266,21 @@ class Leader:
         still = np.zeros_like(axes)
         still[0] = np.eye(3)[..., None]
         p = time_derivatives(
-            series.derivatives(slot_taylor(reference, (np.zeros_like(cm), still), tau)), rates
+            series.taylor_derivatives(slot_taylor(reference, (np.zeros_like(cm), still), tau)),
+            rates,
         )
-        x = time_derivatives(series.derivatives(cm), rates)
-        B = series.series_by_derivatives(time_derivatives(series.derivatives(axes), rates))
+        x = time_derivatives(series.taylor_derivatives(cm), rates)
+        B = series.series_by_derivatives(time_derivatives(series.taylor_derivatives(axes), rates))
         ends = [self.deviation.state_after(each, accelerations, h) for each in dt]
         moves, turns, grows = (
-            np.stack(each, axis=-1) for each in zip(*(e.taylor_series() for e in ends), strict=True)
+            np.stack(each, axis=-1)
+            for each in zip(*(e.similarity_series() for e in ends), strict=True)
         )
-        x += series.derivatives(moves)
+        x += series.taylor_derivatives(moves)
         grown = series.product(series.series_by_derivatives(p), grows[:, None, None])
-        p = series.derivatives(grown)
+        p = series.taylor_derivatives(grown)
         B = series.product(np.moveaxis(turns, -1, 1), np.moveaxis(B, -1, 1), np.matmul)
-        phi = series.derivatives(series.rotation_vector_series(B[0, 0].T @ B))
+        phi = series.taylor_derivatives(series.rotation_vector_series(B[0, 0].T @ B))
         channels = np.concatenate([x.transpose(0, 2, 1), phi], axis=2)  # (3, ends, 6)
         polynomials = Motion(times, _quintics(times, channels), np.ascontiguousarray(B[0, 0].T))
         late, scaled = delay_by(problem, self.clock.delay).reference, self._is_any_scaled(ends)
@@ -323,7 +325,7 @@ class Leader:
         more, least, _ = self._barrier_rows(barriers, arms, limit)
         rows, needed = np.vstack([rows, more]), np.append(needed, least)
         if self._is_any_scaled([self.deviation]) or self._can_scale_slots:
-            more, least = scale_bound_rows(self.deviation)
+            more, least = rows_bounding_scale(self.deviation)
             rows, needed = np.vstack([rows, more]), np.append(needed, least)
         else:
             rows[:, 6] = 0.0
@@ -352,12 +354,12 @@ class Leader:
         cm, axes = body_taylor(self.problem.motion, tau, 3)
         slots = slot_taylor(self.problem.reference, (cm, axes), tau)
         rates = np.array(self.clock.rate[:2])[:, None]
-        c = time_derivatives(series.derivatives(cm), rates)[..., 0]
+        c = time_derivatives(series.taylor_derivatives(cm), rates)[..., 0]
         arm = (
-            time_derivatives(series.derivatives(slots), rates)[..., 0].transpose(0, 2, 1)
+            time_derivatives(series.taylor_derivatives(slots), rates)[..., 0].transpose(0, 2, 1)
             - c[:, None]
         )
-        Q = series.derivatives(self.deviation.taylor_series()[1])
+        Q = series.taylor_derivatives(self.deviation.similarity_series()[1])
         z, z1, _ = self.deviation.scale
         x = self.deviation.x
         # Without the second derivatives that are asked for

@@ -91,7 +91,7 @@ class PointPhase(ActivePhase):
                 if status == records.PAUSED and self.has_stalled():
                     break
         finally:
-            self.record_stretch(stretch)
+            self.record_samples(stretch)
         if status != records.FINISHED:
             collapsed = status == records.COLLAPSED
             own_force = self.external is not None
@@ -106,7 +106,7 @@ class PointPhase(ActivePhase):
         self.extremes.wait_for_steps()
         if not self.state.count[records.TRAILED] or self.flown is None:
             return
-        work = self.workspace if self.solver is None else self.solver.solver_for_thread.workspace
+        work = self.workspace if self.solver is None else self.solver.thread_solver.workspace
         if last or not self.aside:
             self.extremes.monitor_steps(self.flown, work, self.state, last=last)
         else:
@@ -120,13 +120,13 @@ class PointPhase(ActivePhase):
             self.search_extremes(last=True)
             self.flown = problem
             if self.solver is not None:  # a solver keeps state: the monitor has its own
-                self.flown = problem_with_solver(self.solver.solver_for_thread, problem)
+                self.flown = problem_with_solver(self.solver.thread_solver, problem)
         self.begun = True
         samples = np.empty((len(times), len(self.state.y)))
         self.state.count[records.SAMPLES] = 0
         return Stretch(problem, times, samples, fresh, math.nextafter(self.t, math.inf))
 
-    def record_stretch(self, stretch: Stretch) -> None:
+    def record_samples(self, stretch: Stretch) -> None:
         """Store the samples of what was integrated since `prepare_stretch`."""
         state, (problem, times, samples, _, first) = self.state, stretch
         done = int(state.count[records.SAMPLES])

@@ -142,7 +142,7 @@ class Piece:
     layers: LayerSamples | None = None
 
     @cached_property
-    def record(self) -> Record:
+    def forces_and_references(self) -> Record:
         """Forces and references, of the edges of this phase."""
         if not isinstance(self.source, Unevaluated):
             return self.source
@@ -206,11 +206,11 @@ def assemble_result(
     if len(states) == len(pieces):
         r, v = (np.concatenate(parts) for parts in zip(*states, strict=True))
         now = {"position": r.copy(), "velocity": v}  # what is computed later is of what was flown
-        later = [(names, recorded), (CLOSE, partial(distances, mission, worst, r, time))]
+        later = [(names, recorded), (CLOSE, partial(closeness_arrays, mission, worst, r, time))]
     else:
         made = recorded()
         r, now = made["position"], {name: made[name] for name in (*_STATES, *names)}
-        now |= distances(mission, worst, r, time)
+        now |= closeness_arrays(mission, worst, r, time)
     counts = [len(p.time) for p in pieces]
     later += [
         (LATER, partial(_slot_references, mission, [(p.time, p.followed) for p in pieces], tau)),
@@ -293,7 +293,7 @@ def _forces_and_references(
         "distance_rate_reference": record.d_dot,
         "constraint": constraint,
         "multiplier": record.multiplier,
-        "integral": _constraint_integral(pieces, mission.edges),
+        "integral": _error_integrals(pieces, mission.edges),
     }
 
 
@@ -308,7 +308,7 @@ def _flying_mask(mission: Mission, time: Floats) -> Bools | None:
     return None if time[-1] <= lost_at.min() else time[:, None] <= lost_at
 
 
-def distances(
+def closeness_arrays(
     mission: Mission,
     worst: Sequence[dict[str, Extremum]],
     r: Floats,
@@ -460,7 +460,7 @@ def _join_records(pieces: Sequence[Piece], n: int, edges: Ints, *, disturbed: bo
     return out
 
 
-def _constraint_integral(pieces: Sequence[Piece], edges: Ints) -> Floats:
+def _error_integrals(pieces: Sequence[Piece], edges: Ints) -> Floats:
     """Integrals of the constraint errors (K, m); NaN while an edge is not active."""
     rows = []
     for piece in pieces:

@@ -172,7 +172,7 @@ class SampledPhase(ActivePhase):
 
     # -- flying -----------------------------------------------------------------------------------
 
-    def lead_reference(self, *, by_law: bool) -> float:
+    def adapt_reference(self, *, by_law: bool) -> float:
         """Let the layers above the barriers lead the reference, if there are any; returns until when that holds [s]."""
         leader, arrays = self.leader, self.vehicles.avoidance
         if self.flight.clocks.own:
@@ -206,7 +206,7 @@ class SampledPhase(ActivePhase):
     def _tick_duration(self) -> float:
         return self.flight.steps * self.flight.h
 
-    def _delay_events(self) -> None:
+    def _postpone_plan_events(self) -> None:
         """Move the events of the plan that have not come yet by what own clocks are late."""
         plan, t, (t_before, before) = self.plan, self.t, self.late
         late = max(0, round(self.lateness / self._tick_duration)) * self._tick_duration
@@ -259,7 +259,7 @@ class SampledPhase(ActivePhase):
         now = fleet.sampled_segment(len(self.sampled.S), len(self.plan.edges), self.t, max_steps=0)
         fly_ticks(self.plan.problem, self.workspace, self.flight, self.sampled, now)
 
-    def views(self) -> list[View | None]:
+    def views_of_laws(self) -> list[View | None]:
         """What each vehicle with a law of its own will know if a tick of the laws is due; None for those lost."""
         self._measure_if_due()
         laws = self.vehicles.laws
@@ -338,7 +338,7 @@ class SampledPhase(ActivePhase):
                 elif laws is not None:
                     laws.call_laws(plan.phase.name, problem, self.workspace, self.flight, sampled)
                 status = fly_ticks(problem, self.workspace, self.flight, sampled, call, arrays)
-                self._take_over_state()
+                self._copy_true_state()
                 if status == records.ASKS:
                     continue
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
@@ -357,7 +357,7 @@ class SampledPhase(ActivePhase):
             if done:
                 self._store_flown_samples(problem, call, done)
         if self.flight.clocks.own:
-            self._delay_events()
+            self._postpone_plan_events()
         if not np.isfinite(sampled.S).all():
             who = agent_names(np.flatnonzero(~np.isfinite(sampled.S).all(axis=1)))
             raise StoppedError(
@@ -394,7 +394,7 @@ class SampledPhase(ActivePhase):
                 np.add(known, moved, out=known)
         self.flight, self.tabled = self.flight._replace(tables=made), planned
 
-    def _take_over_state(self) -> None:
+    def _copy_true_state(self) -> None:
         """Take over the true state, and what it cost."""
         plan, state, sampled = self.plan, self.state, self.sampled
         n, m, y = len(plan.masses), len(plan.edges), state.y

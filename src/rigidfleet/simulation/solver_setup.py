@@ -40,7 +40,7 @@ def workspace_and_solver(
         steps = solvers.elimination_steps(len(points), edges)
         order = None if steps is None else ordering.pivot_order(steps, plan.problem.graph.edges)
     axes = plan.problem.has_frame or plan.problem.law.k_def > 0.0
-    dissect = partial(solvers.dissection_order, points, edges)
+    dissect = partial(solvers.agent_dissection_order, points, edges)
     solver = large_solver(plan.problem, Setup(order, dissect, *plan.residual_tolerances(), axes))
     plan.problem = problem_with_solver(solver, plan.problem)
     return solver.workspace, solver

@@ -125,7 +125,7 @@ def _fly_in_common_steps(active: Sequence[PointPhase], vector: batch.Vector) -> 
             if active[0].has_stalled():
                 return False
     for phase, stretch in zip(active, stretches, strict=True):
-        phase.record_stretch(stretch)
+        phase.record_samples(stretch)
     return status == records.FINISHED
 
 

@@ -35,9 +35,9 @@ from rigidfleet.math.piecewise import (
 from rigidfleet.mission import Mission, as_mission
 from rigidfleet.result import Extremum, PhaseRecord, Result, presence
 from rigidfleet.result.result import CLOSE, VARIABLES
-from rigidfleet.setpoints import sample_intervals
+from rigidfleet.setpoints import interval_starts
 from rigidfleet.simulation.extremes import CurveWatch
-from rigidfleet.simulation.recording import distances, mission_text_entry
+from rigidfleet.simulation.recording import closeness_arrays, mission_text_entry
 from rigidfleet.typing import Floats, Ints
 
 #: Greatest distance [m] of a curve of fourth degree from the piece that it stands for, and most parts of a piece.
@@ -144,7 +144,7 @@ def trajectories(
             f"times must increase: sample {k + 2} is at {t[k + 1]:g} s, the one before at {t[k]:g} s."
         )
     # A sample that is one representable number after another marks a jump, as at a switch of phases in a result.
-    first, knots = sample_intervals(t)
+    first, knots = interval_starts(t)
     if not len(first):
         raise ResultError(f"all samples are at {t[0]:g} s; a trajectory lasts.")
     yaws = np.full(shape[:2], np.nan) if yaw is None else _check_numbers("yaw", yaw, *shape[:2])
@@ -295,7 +295,7 @@ def result_of_curve(
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
     watch.keep_only(np.ones(n, dtype=np.bool_))  # whose data end near an obstacle has not left it
     record.extremes.update(watch.end_phase())
-    watch.add_flight_extremes([record])
+    watch.add_extremes_to_phases([record])
     record.extremes.update(fastest)
     at, state, yaws = _sample_curve(curve, parts)
     if powers < 3:  # lines turn at once at samples
@@ -381,7 +381,7 @@ def _sample_curve(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats
     time, (pieces, n, _, powers) = curve.time, curve.pieces.shape
     together = max(1, _TOGETHER // (4 * n * powers))
     greatest_of = np.abs(curve.pieces[:, :, :3, :4]).max(axis=(0, 1, 2))
-    scale = 1.0 + series.derivatives(pad(greatest_of, 4))
+    scale = 1.0 + series.taylor_derivatives(pad(greatest_of, 4))
     ends = np.append(np.zeros(pieces - 1, dtype=np.bool_), True)  # which pieces have a sample there
     turn = np.zeros((pieces + 1, n))  # half of the jumps of yaw's rate
     for k in range(0, pieces - 1, together):
@@ -401,7 +401,7 @@ def _sample_curve(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats
     for row in range(0, len(k), together):
         rows = slice(row, row + together)
         after = np.diff(time)[k[rows]] * share[rows]
-        x = series.derivatives(series.polynomial_series(curve.pieces[k[rows]], after, 4))
+        x = series.taylor_derivatives(series.polynomial_series(curve.pieces[k[rows]], after, 4))
         state[:, rows], yaw[:, rows] = x[..., :3], x[:2, ..., 3]
     yaw[1, share == 0.0] -= turn[k[share == 0.0]]
     yaw[1, share == 1.0] += turn[k[share == 1.0] + 1]
@@ -516,7 +516,7 @@ def result_of(
         **known, **unknown, **dict.fromkeys(CLOSE), phases=records, mission_text="",
         statistics=statistics, **ending,
         later=[
-            (CLOSE, partial(distances, mission, worst, r, time, left)),
+            (CLOSE, partial(closeness_arrays, mission, worst, r, time, left)),
             (("mission_text",), partial(mission_text_entry, mission)),
         ],
     )  # fmt: skip

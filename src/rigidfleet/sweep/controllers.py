@@ -22,7 +22,7 @@ def add_search_folder(folder: str | Path) -> None:
         sys.path.append(place)
 
 
-def import_law(name: str) -> tuple[Any, str]:
+def import_law_and_digest(name: str) -> tuple[Any, str]:
     """The function or class of a name MODULE:NAME, and a digest of the file of its module.
 
     Raises

@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field, Strict
 
 from rigidfleet._common.arguments import as_path
-from rigidfleet._common.renamed import rename_hint, with_earlier_names
+from rigidfleet._common.renamed import rename_hint, with_earlier_members
 from rigidfleet._version import __version__
 from rigidfleet.errors import MissionError, RigidfleetError, SweepError, wrong_type
 from rigidfleet.mission import Mission, load_mission, mission_names
@@ -114,7 +114,7 @@ class SweepColumn:
         return not self.has_non_numbers and self.keys[-1] != "seed"
 
 
-@with_earlier_names(document="mission_document", varied="document_of_run")
+@with_earlier_members(document="mission_document", varied="document_of_run")
 class Sweep:
     """A checked sweep. Create one by `Sweep.of`, or from a file by `Sweep.load`.
 
@@ -258,7 +258,7 @@ class Sweep:
         if not name:
             return None, ""
         try:
-            return controllers.import_law(name)
+            return controllers.import_law_and_digest(name)
         except ImportError as error:
             raise RigidfleetError(f"{key}: {error}\n    {controllers.REMEDY}") from error
 
@@ -270,7 +270,7 @@ class Sweep:
         return f"rigidfleet {__version__}{law}"
 
     @property
-    def has_random_numbers(self) -> bool:
+    def has_random_flights(self) -> bool:
         """Whether the first run has random numbers: of noise, gusts, network or sensing."""
         tables = (*_SEEDED[:3], ("avoidance", "sensing_noise"))
         return any(look_up(self.document_of_run(0), keys) for keys in tables)
@@ -491,7 +491,7 @@ class _Check:
             variation = self._check_variation(k, entry)
             path = look_up(self.data, ("vary", k, "path"))
             if self.mission is not None and isinstance(path, str):
-                self._check_places(k, path, variation, starts=by_final_states)
+                self._check_varied_path(k, path, variation, starts=by_final_states)
             variations += [] if variation is None else [variation]
         if by_final_states and self.mission is not None:
             from rigidfleet.simulation.ensemble import why_unfit_for_establish
@@ -501,7 +501,7 @@ class _Check:
         if self.mission is not None:
             self._check_added_keys(self.mission)
         if header is not None and header.law_key_and_name[1]:
-            self._check_own_law(*header.law_key_and_name, header)
+            self._check_user_law(*header.law_key_and_name, header)
         if "rate" in self.data and not self.data.get("controller"):
             self.add(("rate",), "is that of a controller", "give a controller, or remove rate")
         self._check_groups(variations)
@@ -526,13 +526,13 @@ class _Check:
         variation = None if model is None else self.collector.validate(model, entry, where)
         if variation is None or len(self.collector.findings) > before:
             return None
-        if problem := variation.find_error():
+        if problem := variation.find_key_conflict():
             key, *words = problem
             self.add((*where, key), *words, getattr(variation, key))
             return None
         return variation
 
-    def _check_places(self, k: int, path: str, v: Variation | None, *, starts: bool) -> None:
+    def _check_varied_path(self, k: int, path: str, v: Variation | None, *, starts: bool) -> None:
         """Check that the path of a variation exists in the mission and can take its values.
 
         With ``starts``, only start states can vary.
@@ -568,7 +568,7 @@ class _Check:
                 problem = "with final states alone, only numbers in agents.position and agents.velocity can vary"
                 remedy = f"remove it, or {_WHOLE}"
             else:
-                if absent or keypaths.is_absent(self.whole, keys):
+                if absent or keypaths.is_table_absent(self.whole, keys):
                     self.lacked.append((k, SweepColumn(v, keys)))
                 continue
             self.add(where, problem, remedy, path)
@@ -591,10 +591,10 @@ class _Check:
                 remedy = f"in the mission, {finding.remedy}"
                 self.add(("vary", k, "path"), problem, remedy, column.variation.path)
 
-    def _check_own_law(self, key: str, name: str, header: SweepHeader) -> None:
+    def _check_user_law(self, key: str, name: str, header: SweepHeader) -> None:
         """Check that the user's law can be imported, and suits the mission."""
         try:
-            controllers.import_law(name)
+            controllers.import_law_and_digest(name)
         except ImportError as error:
             self.add((key,), str(error), controllers.REMEDY)
         if header.evaluate == "final":

@@ -296,7 +296,7 @@ class Show:
 
         who = fault.who
         again = np.isin(np.arange(self.n), who)
-        way, knots = self.way_by_fault(fault), self.curve.time
+        way, knots = self.way_with_fault(fault), self.curve.time
         if not np.array_equal(knots, way.time):
             knots = common_knots([self.curve, way])
         way = way.refine(knots, stays=True)
@@ -315,7 +315,7 @@ class Show:
         mission = Mission.from_plain(data, "drill")
         return result_of_curve(Piecewise(knots, pieces), self.how, mission=mission), every
 
-    def way_by_fault(self, fault: GeometricFault) -> Piecewise:
+    def way_with_fault(self, fault: GeometricFault) -> Piecewise:
         """The ways (K, S, 4, P) that vehicles (S,) fly by a fault, on knots of their own."""
         kind, size, who, stream = fault
         pads, flown, turn, by = self.curve.pieces[0, :, :2, 0], self._ways_of(who), np.eye(2), 0.0

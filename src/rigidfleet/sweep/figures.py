@@ -27,7 +27,7 @@ from rigidfleet.sweep.summary import (
     Borne,
     correlations_by_strength,
     failure_counts,
-    fault_rates,
+    failure_rates,
     outcomes,
     varied_numbers,
     wilson_interval,
@@ -90,13 +90,13 @@ def plot(
     """
     draw: dict[str, Callable[[Table], Figure | None]] = {
         "histograms": histograms,
-        "envelopes": envelopes,
+        "envelopes": metrics_over_drivers,
         "outcome": success_figure,
         "drivers": correlations,
         "map": partial(map_over_two, over=over, metric=metric),
     }
     if table.sweep.drill is not None:
-        draw = {"drill": failure_share_figure, "worst": worst_runs}
+        draw = {"drill": failure_share_figure, "worst": worst_run_maps}
     files = []
     for name, drawn in draw.items():
         with st.apply_style(), st.figure_options(titles=titles):
@@ -127,7 +127,7 @@ def success_figure(table: Table) -> Figure | None:
     )
     right.set_title("failed checks", loc="left")
     if not reasons:
-        st.write_note(right, "no run failed")
+        st.mark_empty(right, "no run failed")
         right.grid(visible=False)
         right.tick_params(bottom=False, labelbottom=False)
         return fig
@@ -143,7 +143,7 @@ def success_figure(table: Table) -> Figure | None:
 
 def failure_share_figure(table: Table) -> Figure | None:
     """Share of the runs of a drill that fail, over the magnitudes of each fault."""
-    cases = fault_rates(table)
+    cases = failure_rates(table)
     if not cases:
         return None
     names = list(dict.fromkeys(case.fault for case in cases))
@@ -167,9 +167,9 @@ def failure_share_figure(table: Table) -> Figure | None:
     return fig
 
 
-def worst_runs(table: Table) -> Figure | None:
+def worst_run_maps(table: Table) -> Figure | None:
     """Of each fault that fails, the worst run from above: whom it concerns when it fails, and their ways until then."""
-    failed = [case for case in fault_rates(table) if case.worst]
+    failed = [case for case in failure_rates(table) if case.worst]
     worst = {
         name: min((x for x in failed if x.fault == name), key=lambda x: x.separation or 0.0)
         for name in dict.fromkeys(case.fault for case in failed)
@@ -247,7 +247,7 @@ def histograms(table: Table) -> Figure | None:
     return fig
 
 
-def envelopes(table: Table) -> Figure | None:
+def metrics_over_drivers(table: Table) -> Figure | None:
     """Every metric over the number with the strongest correlation: runs, median and the middle 90 %."""
     strongest: dict[str, str] = {}
     for d in correlations_by_strength(table):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet.assessment.fits import formation_fits
+from rigidfleet.assessment.fits import fit_samples
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission
 from rigidfleet.mission.bounds import LENGTH, SPEED
@@ -21,7 +21,7 @@ from rigidfleet.mission.formations import coincident_pairs
 from rigidfleet.mission.kinds import seconds
 from rigidfleet.simulation.ensemble import Ensemble, establish, max_edge_error
 from rigidfleet.sweep.metrics import METRICS
-from rigidfleet.sweep.record import RunRecord, refusal_reason
+from rigidfleet.sweep.record import RunRecord, reason_and_detail
 from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def _invalid_runs(
         try:
             sweep.mission_of(runs[k])
         except MissionError as error:
-            refusals[int(k)] = refusal_reason(error)
+            refusals[int(k)] = reason_and_detail(error)
     return refusals
 
 
@@ -127,7 +127,7 @@ def _judge_states(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], 
         slots = mission.formation_slots(formation)
         if slots is None or len(slots) < 2:
             continue
-        fits = [*formation_fits(r, slots, np.arange(len(slots)), allowed)]
+        fits = [*fit_samples(r, slots, np.arange(len(slots)), allowed)]
         metrics["shape_end"] = error = np.array([fit.error for fit in fits])
         metrics["shape"] = np.fmax(metrics["shape"], error)
         misshapen = error > fits[0].limit

@@ -39,7 +39,7 @@ class RunRecord:
     level: str = field(default_factory=levels.target_instruction_level)
 
 
-def refusal_reason(error: MissionError) -> tuple[str, str]:
+def reason_and_detail(error: MissionError) -> tuple[str, str]:
     """Reason and detail of a run whose mission has errors."""
     first = error.findings[0]
     words = f"{first.key} = {first.value!r}: {first.problem}"

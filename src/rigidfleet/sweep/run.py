@@ -14,7 +14,7 @@ from rigidfleet.mission import Mission
 from rigidfleet.sweep import faults
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS, measure_metrics
-from rigidfleet.sweep.record import BROKEN, RAISED, RunRecord, refusal_reason
+from rigidfleet.sweep.record import BROKEN, RAISED, RunRecord, reason_and_detail
 from rigidfleet.typing import Ints
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ def _run_row(sweep: Sweep, run: int, values: Sequence[Any], flown: Any, begun: f
     outcome = flown if done else _value_or_error(lambda: _metrics_and_failure(flown))
     match outcome:
         case MissionError():
-            reason, detail = refusal_reason(outcome)
+            reason, detail = reason_and_detail(outcome)
         case FlightError() if sweep.header.law_key_and_name[1]:
             reason, detail = RAISED, str(outcome)
         case Exception():

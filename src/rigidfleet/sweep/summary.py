@@ -262,13 +262,13 @@ def summarise(table: store.Table) -> Summary:
         percentiles,
         correlations_by_strength(table),
         by_value,
-        numbers if sweep.has_random_numbers else "none",
+        numbers if sweep.has_random_flights else "none",
         table.levels,
-        fault_rates(table),
+        failure_rates(table),
     )
 
 
-def fault_rates(table: store.Table) -> list[Borne]:
+def failure_rates(table: store.Table) -> list[Borne]:
     """How often each fault of a drill fails; empty for other sweeps."""
     cases = []
     for codes in np.unique(table.codes, axis=0) if table.sweep.drill else []:

@@ -49,7 +49,7 @@ def start_processes(count: int) -> Generator[Executor]:
     starts on its own.
     """
     before = set(multiprocessing.active_children())
-    forked = _has_one_thread()
+    forked = _is_fork_safe()
     context = multiprocessing.get_context("fork" if forked else "spawn")
     # Before a spawned process receives the module path of its parent, it would search the current folder first, even
     # for modules of the standard library; so would multiprocessing's resource tracker.
@@ -69,7 +69,7 @@ def start_processes(count: int) -> Generator[Executor]:
                 process.terminate()
 
 
-def _has_one_thread() -> bool:
+def _is_fork_safe() -> bool:
     """Whether a fork of this process is whole: another thread would be missing, and a lock that it holds never free.
 
     Linux tells; other systems do not, and on some of them libraries forbid forks.

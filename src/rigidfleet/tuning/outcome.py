@@ -12,7 +12,7 @@ import numpy as np
 
 from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.plain import to_json_data
-from rigidfleet._common.renamed import with_earlier_names
+from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.math.margins import Margins
 from rigidfleet.sweep.record import reason_in_words
 from rigidfleet.tuning.gains import Gains
@@ -58,7 +58,7 @@ class Flown:
         }  # fmt: skip
 
 
-@with_earlier_names(rows="table_rows")
+@with_earlier_members(rows="table_rows")
 @dataclass
 class Tuned(Shown):
     """Result of a study; print it to see both sides.

@@ -123,7 +123,7 @@ def _array_at(context: Any, builder: Any, kind: types.Array, array: Any, shape: 
     return array._getvalue()
 
 
-def pointer_to(to: types.BaseNamedTuple) -> Any:
+def pointer_cast(to: types.BaseNamedTuple) -> Any:
     """Return the compiled function that converts an int64 to the address of a named tuple."""
 
     @intrinsic

@@ -340,12 +340,12 @@ def _reduce_lanes(_context, x, largest):
     return types.float64(x, types.boolean), generate
 
 
-def lane_sum_or_worst(x, states):
+def one_flight_sum_or_worst(x, states):
     """Sum over the lanes of x if ``states`` belong to one flight; otherwise the value of the worst flight."""
     raise NotImplementedError("compiled code only")
 
 
-@overload(lane_sum_or_worst)
+@overload(one_flight_sum_or_worst)
 def _overload_lane_sum_or_worst(x, states):
     if states.dtype == lanes:
         return lambda x, states: _reduce_lanes(x, True)

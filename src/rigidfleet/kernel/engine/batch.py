@@ -270,7 +270,7 @@ def fly_all(
         The problem does not fit vectors, see `fits`.
     """
 
-    def make_single_worker() -> Callable[..., None]:
+    def make_scalar_worker() -> Callable[..., None]:
         d0 = problem.reference.d0.copy()
         own = problem._replace(reference=problem.reference._replace(d0=d0))
         w = workspace(len(problem.vehicles.m), len(d0), solver=problem.law.solver)
@@ -289,7 +289,7 @@ def fly_all(
         return fly_one_by_one
 
     if not vectors:
-        return _fly_in_threads(make_single_worker, starts, before, threads)
+        return _fly_in_threads(make_scalar_worker, starts, before, threads)
     if not can_unroll(problem):
         raise ValueError("flights of this problem cannot share vectors; use vectors=False")
     count, n = starts.shape
@@ -300,7 +300,7 @@ def fly_all(
             x = x[np.minimum(np.arange(padded(count)), count - 1)]
         return pack_lanes(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
 
-    def make_worker() -> Callable[..., None]:
+    def make_vector_worker() -> Callable[..., None]:
         K = np.zeros((lane_steps.ROWS, n, WIDTH))
         K[lane_steps.ATOL] = atol[:, None]
         y, clock, counts = (
@@ -319,13 +319,13 @@ def fly_all(
 
         return fly_range
 
-    ends = _fly_in_threads(make_worker, in_lanes(starts), in_lanes(before), threads)
+    ends = _fly_in_threads(make_vector_worker, in_lanes(starts), in_lanes(before), threads)
     y = unpack(ends.y).swapaxes(1, 2).reshape(-1, n)[:count]
     finished = np.repeat(ends.finished, WIDTH)[:count]
     evaluations = np.repeat(ends.evaluations, WIDTH)[:count]
     lost = ~finished
     if lost.any():
-        again = _fly_in_threads(make_single_worker, starts[lost], before[lost], threads)
+        again = _fly_in_threads(make_scalar_worker, starts[lost], before[lost], threads)
         y[lost], finished[lost], evaluations[lost] = again.y, again.finished, again.evaluations
     return FinalStates(y, finished, evaluations)
 
@@ -333,7 +333,7 @@ def fly_all(
 def _fly_in_threads(
     begin: Callable[[], Callable[..., None]], starts: Floats, before: Floats, threads: int
 ) -> FinalStates:
-    """Distribute flights, or vectors of them, over threads; each thread calls `make_worker` for its own data."""
+    """Distribute flights, or vectors of them, over threads; each thread calls `make_vector_worker` for its own data."""
     count = len(starts)
     threads = min(threads, count)
     ends = np.empty_like(starts)

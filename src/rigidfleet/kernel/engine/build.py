@@ -28,7 +28,7 @@ from rigidfleet.kernel import (
 )
 from rigidfleet.kernel.avoidance import AvoidanceArrays
 from rigidfleet.kernel.compiler.jit import OPTIONS
-from rigidfleet.kernel.compiler.pointers import Pointer, pointer_to
+from rigidfleet.kernel.compiler.pointers import Pointer, pointer_cast
 from rigidfleet.kernel.engine import objects, packing
 from rigidfleet.kernel.measured import Measured
 from rigidfleet.kernel.problem import Problem, Workspace
@@ -80,7 +80,8 @@ def monitor_object_code() -> list[bytes]:
     with_law = Problem, Workspace, IntegratorState, Monitor
     calls = (
         ("bound_moves", lambda p, s, m: monitor.bound_distance_changes(p, s, m), *watched),
-        ("watch_distances", lambda i, j, p, s, m: monitor.watch_distances(i, j, p, s, m), word, word, *watched),
+        ("watch_trail_distances",
+         lambda i, j, p, s, m: monitor.watch_trail_distances(i, j, p, s, m), word, word, *watched),
         ("watch_forces", lambda last, p, w, s, m: monitor.watch_forces(last, p, w, s, m), word, *with_law),
         ("measure", lambda m: measurement.measure_samples(m), Measured),
         ("follow", lambda s: recursion.run_linear_recursion(s), Recursion),
@@ -104,7 +105,7 @@ def avoidance_object_code() -> list[bytes]:
     """Object code of avoidance in flight."""
     from rigidfleet.kernel import guard
 
-    problem, workspace = (pointer_to(_numba_type_of(kind)) for kind in (Problem, Workspace))
+    problem, workspace = (pointer_cast(_numba_type_of(kind)) for kind in (Problem, Workspace))
 
     def avoid(f, s, a, _):
         return guard.guard_forces(problem(a.law[0]), workspace(a.law[1]), f, s, a)
@@ -120,7 +121,7 @@ def solids_object_code() -> list[bytes]:
 
     row_of = monitor.trail_row_of
 
-    def watch_solids(first, end, p, state, watch, s):
+    def watch_trail_clearances(first, end, p, state, watch, s):
         for step in range(first, end):
             row, trail = row_of(step, state), state.trail
             watch_clearances(
@@ -128,7 +129,9 @@ def solids_object_code() -> list[bytes]:
             )
 
     kinds = types.int64, types.int64, Problem, IntegratorState, Monitor, Solids
-    return [_object_code(*_ir_text(watch_solids, *kinds), "watch_solids", hot=())]
+    return [
+        _object_code(*_ir_text(watch_trail_clearances, *kinds), "watch_trail_clearances", hot=())
+    ]
 
 
 def large_solver_object_code() -> list[bytes]:

@@ -35,7 +35,7 @@ from rigidfleet.kernel.engine.objects import (
     ENTRIES,
     compile_objects,
     join_object_codes,
-    shared_object_path,
+    shipped_object_path,
     split_object_codes,
     symbol_name,
     target_machine,
@@ -126,14 +126,14 @@ class Watch:
     ) -> None:
         """Search the steps from ``first`` to before ``end`` for extremes of distances and speeds."""
         of = pack(problem).address, pack(state).address, self.address
-        library().watch_distances(first, end, *of)
+        library().watch_trail_distances(first, end, *of)
 
     def search_clearances(
         self, problem: Problem, state: IntegratorState, first: int, end: int, solids: Solids
     ) -> None:
         """Search the same steps for clearances to all ``solids``, see `rigidfleet.kernel.obstacles`."""
         of = pack(problem).address, pack(state).address, self.address
-        library("solids").watch_solids(first, end, *of, pack(solids).address)
+        library("solids").watch_trail_clearances(first, end, *of, pack(solids).address)
 
     def search_forces(
         self, problem: Problem, workspace: Workspace, state: IntegratorState, *, last: bool
@@ -258,7 +258,7 @@ def _shipped_code(digest: str) -> list[Path]:
     RigidfleetError
         The environment fixes a level that this machine cannot run.
     """
-    file = shared_object_path(runnable_instruction_level(), digest)
+    file = shipped_object_path(runnable_instruction_level(), digest)
     return list(file.parent.glob(file.name))
 
 
@@ -296,6 +296,6 @@ def _cache_code(parts: Sequence[bytes], part: str) -> None:
         warn_not_cached(error)
 
 
-def is_compiled() -> bool:
+def has_machine_code() -> bool:
     """Return whether there is machine code, shipped or in the cache, so that nothing has to be compiled."""
     return bool(_shipped_code(sources_digest())) or _read_cached_code("flight") is not None

@@ -22,18 +22,18 @@ ENTRIES = {
         "integrate": 4,  # problem, workspace, integrator, segment
         "record": 4,  # problem, workspace, segment, record
         "bound_moves": 3,  # problem, integrator, monitor
-        "watch_distances": 5,  # first, end, problem, integrator, monitor
+        "watch_trail_distances": 5,  # first, end, problem, integrator, monitor
         "watch_forces": 5,  # last, problem, workspace, integrator, monitor
         "measure": 1,
         "follow": 1,
     },
     "sampled": {"fly_ticks": 5},
     "avoidance": {"avoid": 4},  # flight, state, avoidance, 0
-    "solids": {"watch_solids": 6},  # first, end, problem, integrator, monitor, solids
+    "solids": {"watch_trail_clearances": 6},  # first, end, problem, integrator, monitor, solids
     "large": dict.fromkeys(
         (
             "solve", "multipliers", "elimination_tree", "count_factor_blocks", "list_factor_blocks", "assemble",
-            "factor", "apply_J", "apply_Jt", "inner", "project_on_solutions",
+            "factor", "apply_J", "apply_Jt", "inner", "project_on_past_solutions",
             "conjugate_gradients", "conjugate_gradients_single",
         ), 1
     ),
@@ -68,7 +68,7 @@ def build_command(part: str = "flight") -> list[str]:
     return [sys.executable, *flags, "-P", "-c", _BUILD.format(part), *path, home]
 
 
-def shared_object_path(of: str, digest: str) -> Path:
+def shipped_object_path(of: str, digest: str) -> Path:
     """Where the package has the machine code of a level, made of sources with this digest."""
     return Path(__file__).with_name(f"{of}-{digest}.so")
 

@@ -63,7 +63,7 @@ class Packed(NamedTuple):
 _buffer = (ctypes.c_char * 0).from_buffer
 
 
-def _flatten_tuple(x: Any) -> tuple[Any, list[Any], list[Any]]:
+def _tuple_words(x: Any) -> tuple[Any, list[Any], list[Any]]:
     """A named tuple, the kinds of its numbers and arrays, and its words."""
     kinds: list[Any] = []
     words: list[Any] = []
@@ -81,7 +81,7 @@ def _flatten_tuple(x: Any) -> tuple[Any, list[Any], list[Any]]:
             words.append(value)
             kinds.append(float)
         elif isinstance(value, tuple):
-            _, own, inside = _memoise_last(_flatten_tuple, value)
+            _, own, inside = _memoise_last(_tuple_words, value)
             kinds += own
             words += inside
         else:
@@ -98,7 +98,7 @@ def pack_uncached(x: Any) -> Packed:
     TypeError
         Numbers or arrays are not of the types that the kernel is compiled for.
     """
-    _, kinds, values = _flatten_tuple(x)
+    _, kinds, values = _tuple_words(x)
     expected, code = _word_layout(type(x))
     if kinds != expected:
         raise TypeError(
@@ -145,7 +145,7 @@ def forget_last_packed() -> None:
 @cache
 def _word_layout(kind: type) -> tuple[list[Any], struct.Struct]:
     """Kinds of the numbers and arrays of a type of named tuple, and how its words are stored."""
-    _, kinds, words = _flatten_tuple(example_of(kind))
+    _, kinds, words = _tuple_words(example_of(kind))
     return kinds, struct.Struct("=" + "".join("d" if type(x) is float else "q" for x in words))
 
 
@@ -192,7 +192,7 @@ def example_tuples() -> tuple[
     watching = new_monitor(one, nowhere, nowhere, 6, 3)
     work = kernel_workspace(1, 0)
     vehicles = fleet.quadrotor_arrays([fleet.VehicleDynamics(1.0, point=True)])
-    flight = fleet.ideal_flight(vehicles, start=0.0, h=0.0, steps=1)
+    flight = fleet.new_ideal_flight(vehicles, start=0.0, h=0.0, steps=1)
     S = np.zeros((1, fleet.STATES))
     rows = np.zeros((0, 1, 3))
     return (
@@ -234,7 +234,7 @@ def _large_solver_examples() -> tuple[Any, ...]:
         "apply_J": {"u": a, "edges": edges, "a": a, "scale": 1.0, "out": b},
         "apply_Jt": {"u": a, "edges": edges, "b": b, "scale": 1.0, "out": a},
         "inner": {"a": a, "b": a},
-        "project_on_solutions": matrix | {"g": a, "past": many, "gram": frame, "x": a},
+        "project_on_past_solutions": matrix | {"g": a, "past": many, "gram": frame, "x": a},
         "conjugate_gradients": gradients,
         "conjugate_gradients_single": gradients | {"L": blocks.astype(np.float32)},
     }  # fmt: skip

@@ -120,7 +120,7 @@ class LargeSolver:
         self.pulled = True
 
     @cached_property
-    def solver_for_thread(self) -> LargeSolver:
+    def thread_solver(self) -> LargeSolver:
         """Another solver of the same equations, in a workspace of its own, for another thread."""
         with_h = self.workspace.H.size > 0
         own = workspace(len(self.a), len(self.edges), with_h=with_h, large=True)
@@ -225,7 +225,9 @@ class LargeSolver:
         )
         self.counts.solves += 1
         m, mbar, mu = self.vehicles.m, self.mbar, self.mu
-        call_large("project_on_solutions", w.u, self.edges, m, mbar, mu, self.g, past, self.gram, x)
+        call_large(
+            "project_on_past_solutions", w.u, self.edges, m, mbar, mu, self.g, past, self.gram, x
+        )
         while True:
             new = self.axes is None or self.wasted > self.worth
             if new:

@@ -260,7 +260,7 @@ class Pilot:
         else:  # nobody has met it
             self.balls.remove(ball)
 
-    def step(self) -> Result:
+    def fly_tick(self) -> Result:
         """Fly one tick; return the record of its end alone.
 
         A flight that cannot go on says why in ``flight.ending``, and stops.

@@ -22,7 +22,7 @@ from rigidfleet.web.live.balls import AT_ONCE, FASTEST, LARGEST, SMALLEST
 from rigidfleet.web.live.guarding import with_avoidance_or_reason
 from rigidfleet.web.live.pilot import TICK, Pilot
 from rigidfleet.web.replay.page import asset_text, page
-from rigidfleet.web.replay.scene import describe_scene, page_samples, scene_points, vehicle_weight
+from rigidfleet.web.replay.scene import describe_scene, mean_weight, page_samples, scene_points
 
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 #: Full colour of an edge, as a share of a vehicle's weight.
@@ -52,7 +52,7 @@ class Session:
         self.flown: Result | None = None  # the last flight that ended
         self.farewell = ""
         self.shown = np.arange(min(len(mission.edges), _EDGES))
-        self.tension = _TENSION * vehicle_weight(mission)
+        self.tension = _TENSION * mean_weight(mission)
         self.lock = threading.RLock()
         self.pages: set[queue.Queue[bytes | None]] = set()
         self.stopped = threading.Event()
@@ -65,7 +65,7 @@ class Session:
         """Begin a new flight."""
         self.pilot = Pilot(self.mission)
         self.flights += 1
-        self.result = self.pilot.step()
+        self.result = self.pilot.fly_tick()
         columns = page_samples(self.result, self.shown, self.tension)
         start = self.mission.fleet.position
         ends = start.min(axis=0) - _AROUND, start.max(axis=0) + _AROUND
@@ -176,20 +176,20 @@ class Session:
         with self.lock:
             match order:
                 case {"move": move, "turn": turn}:
-                    self.pilot.steer(_as_vector(move, _FASTEST), _as_vector(turn, _TURNING))
+                    self.pilot.steer(_clamp(move, _FASTEST), _clamp(turn, _TURNING))
                 case {"formation": str(name)} if name in self.pilot.formations:
                     self.pilot.change_formation(name)
                 case {"gust": direction, "strength": strength}:
                     strength = _clamped_number(strength, _STRONGEST)
-                    direction = _as_vector(direction, 1.0)
+                    direction = _clamp(direction, 1.0)
                     if not np.linalg.norm(direction) > 0.0:  # the square of a tiny one is 0
                         raise ValueError("a gust needs a direction")
                     self.pilot.send_gust(direction, strength)
                 case {"ball": place, "radius": radius, "velocity": velocity}:
-                    place, velocity = _as_vector(place, _FARTHEST), _as_vector(velocity, _FASTEST)
+                    place, velocity = _clamp(place, _FARTHEST), _clamp(velocity, _FASTEST)
                     self.pilot.add_ball(place, _clamped_number(radius, _FARTHEST), velocity)
                 case {"pull": int(slot), "to": place}:
-                    goal = None if place is None else _as_vector(place, _FARTHEST)
+                    goal = None if place is None else _clamp(place, _FARTHEST)
                     self.pilot.pull_ball(slot, goal)
                 case {"remove": int(slot)}:
                     self.pilot.remove_ball(slot)
@@ -248,7 +248,7 @@ class Session:
                 measured, flown = now, 0
             with self.lock:
                 if self.pages and not (self.paused or self.pilot.flight.ending):
-                    self.result = self.pilot.step()
+                    self.result = self.pilot.fly_tick()
                     flown += 1
                     self._send_to_pages(self._sample_event())
                 else:
@@ -274,7 +274,7 @@ def _clamped_number(value: Any, most: float) -> float:
     return float(min(max(value, -most), most))
 
 
-def _as_vector(value: Any, most: float) -> np.ndarray:
+def _clamp(value: Any, most: float) -> np.ndarray:
     if not isinstance(value, list) or len(value) != 3:
         raise ValueError("the value must be a list of three numbers")
     return np.array([_clamped_number(x, most) for x in value])

@@ -25,10 +25,10 @@ from rigidfleet.web.replay.pack import PackedColumn, pack_columns
 from rigidfleet.web.replay.page import page
 from rigidfleet.web.replay.scene import (
     describe_scene,
+    mean_weight,
     page_samples,
     scene_points,
     typical_formation_radius,
-    vehicle_weight,
 )
 
 __all__ = ["Replay", "replay", "replay_page"]
@@ -99,7 +99,7 @@ def replay_page(result: Result) -> str:
     """The page that `replay` writes."""
     time, shown = _page_times(result), _drawn_edges(result)
     most = float(np.nanmax(np.abs(result.multiplier[:, shown]), initial=0.0))
-    scale = vehicle_weight(result.mission)
+    scale = mean_weight(result.mission)
     tension = min(max(most, _IDLE * scale), _HEAVY * scale)
     columns, swarm = page_samples(result, shown, tension), result.n_agents > _SWARM
     if swarm:  # dots have neither attitudes nor slots
@@ -110,7 +110,7 @@ def replay_page(result: Result) -> str:
             for name, c in columns.items()
         }
     )
-    info = describe_scene(result, shown, tension) | _flight_information(result, time)
+    info = describe_scene(result, shown, tension) | _page_information(result, time)
     if has_lights(result):
         azimuth, elevation = angles_facing_formation(result)
         info |= {"night": True, "azimuth": azimuth, "elevation": elevation}
@@ -155,7 +155,7 @@ def _drawn_edges(result: Result) -> Ints:
     return np.sort(np.argsort(typical, kind="stable")[:_EDGES])
 
 
-def _flight_information(result: Result, time: Floats) -> dict[str, Any]:
+def _page_information(result: Result, time: Floats) -> dict[str, Any]:
     """Information on the page about a finished flight."""
     low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
     extent, reach = float(np.linalg.norm(high - low)) / 2, typical_formation_radius(result)

@@ -207,12 +207,12 @@ def typical_formation_radius(result: Result) -> float:
     return float(np.median(reach))
 
 
-def vehicle_weight(mission: Mission) -> float:
+def mean_weight(mission: Mission) -> float:
     """Weight [N] of a vehicle; without gravity a tenth of that on Earth."""
     return float(np.mean(mission.agents.mass)) * max(mission.gravity, 1.0)
 
 
-def _plot_lines(values: Floats) -> Floats:
+def _envelope_if_many(values: Floats) -> Floats:
     """Lines (K, L) of a plot: the values (K, N) of each vehicle, or of many the least and the greatest."""
     if values.shape[1] <= _LINES:
         return values
@@ -235,7 +235,7 @@ def _plots(result: Result) -> Iterator[tuple[dict[str, Any], PackedColumn]]:
     if has_rotors(result):
         share = 100.0 * rotor_forces(result).max(axis=2) / rotor_limits(mission)
         look: dict[str, Any] = {"unit": "%", "colours": colours, "limits": [100.0] * len(colours)}
-        yield plot_entry("rotor", "Rotors, share of limit", _plot_lines(share), 0.1, **look)
+        yield plot_entry("rotor", "Rotors, share of limit", _envelope_if_many(share), 0.1, **look)
     elif off is None and result.interpolation is None:  # else nobody knows the thrust
         title, thrust, most = "Greatest thrust", result.thrust, mission.fleet.thrust_limit
         look = {"unit": "N", "colours": colours, "limits": mission.agents.thrust_limit}
@@ -244,7 +244,7 @@ def _plots(result: Result) -> Iterator[tuple[dict[str, Any], PackedColumn]]:
             if len(set(mission.agents.thrust_limit)) > 1:
                 title, thrust = f"{title}, as share of limit", 100.0 * thrust / most
                 look |= {"unit": "%", "limits": [None, 100.0]}
-        yield plot_entry("thrust", title, _plot_lines(thrust), 1e-3, **look)
+        yield plot_entry("thrust", title, _envelope_if_many(thrust), 1e-3, **look)
     if off is not None or has_rotors(result):
         worst, limit = quantities.samples(result, "tracking_error").worst, limits.tracking_error
         if off is not None:  # beside the line, the band that it may be in
