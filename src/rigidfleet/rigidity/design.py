@@ -57,7 +57,7 @@ def design(
     barrier potential tr (M - t)^-1, for t = 0 and then closer and closer to w (Batson, Spielman and Srivastava,
     2012). The search starts from all candidates thinned out, from Delaunay's triangulation or from the convex hull,
     whichever is best, and again from perturbed designs while its budget lasts: a tenth of a second for 8 agents, one
-    or two seconds for 30 to 100.
+    or two seconds for 30, some seconds for 100.
 
     Parameters
     ----------
