@@ -113,15 +113,15 @@ def with_fixed_agents(problem: Problem, fixed: Ints) -> Problem:
     )
 
 
-def drop_lost(
+def without_lost(
     problem: Problem,
-    edges: Bools,
+    kept: Bools,
     lost: Bools,
     mu: float,
     *,
     large: bool = False,
 ) -> Problem:
-    """The problem of the remaining agents: only the ``edges`` (m,) kept, and no thrust of the agents ``lost`` (N,).
+    """The problem of the remaining agents: only the edges ``kept`` (m,), and no thrust of the agents ``lost`` (N,).
 
     In the control laws, lost agents have the mass `NOTHING`. The mean mass, which scales the damping ``mu``, is that
     of the remaining agents. The equations of motion keep the lost agents and their masses.
@@ -132,8 +132,8 @@ def drop_lost(
     return problem._replace(
         vehicles=problem.vehicles._replace(m=m, inverse=1.0 / m, M=float(m.sum()), mean=mean),
         law=problem.law._replace(mu=mu),
-        graph=graph(problem.graph.edges[edges], m, large=large),
-        reference=reference._replace(d0=reference.d0[edges], d1=reference.d1[edges]),
+        graph=graph(problem.graph.edges[kept], m, large=large),
+        reference=reference._replace(d0=reference.d0[kept], d1=reference.d1[kept]),
         control=control._replace(force=np.where(lost[:, None], 0.0, control.force)),
         disturbance=problem.disturbance._replace(lost=lost.copy()),
     )

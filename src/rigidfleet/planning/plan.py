@@ -46,7 +46,7 @@ from rigidfleet.planning import solvers
 from rigidfleet.planning.body_trajectories import points_passed
 from rigidfleet.planning.certificate import Certificate
 from rigidfleet.planning.courses import regulators
-from rigidfleet.planning.disturbances import drop_lost, with_fixed_agents
+from rigidfleet.planning.disturbances import with_fixed_agents, without_lost
 from rigidfleet.planning.legs import Leg
 from rigidfleet.planning.reference import PhaseState, Pose, copy_as, copy_with, pose_at
 from rigidfleet.planning.tolerances import (
@@ -188,7 +188,9 @@ class PhasePlan(Leg):
         self.edges, self.distances = self.edges[kept], self.distances[kept]
         self.__dict__.pop("tolerances", None)
         self.method = solvers.choose_method(len(lost), self.edges, self.constraint.solver)
-        self.problem = drop_lost(self.problem, kept, lost, self.damping(lost), large=self.is_large)
+        self.problem = without_lost(
+            self.problem, kept, lost, self.damping(lost), large=self.is_large
+        )
         return kept
 
     def state_at_end(self, t: float, y: Floats, w: Workspace) -> PhaseState:

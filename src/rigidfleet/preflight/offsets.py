@@ -43,7 +43,7 @@ def offsets_from_slots(mission: Mission, way: list[PlannedPhase]) -> list[Floats
     """Offsets (K, N, 3) [m] of the vehicles from their slots in each planned phase; zeros where none are tracked."""
     tracked = [planned.leg.phase.control == "tracking" for planned in way]
     pushes = [
-        _unknown_accelerations(mission, planned) if one else np.zeros_like(planned.position)
+        _unmodelled_accelerations(mission, planned) if one else np.zeros_like(planned.position)
         for planned, one in zip(way, tracked, strict=True)
     ]
     if not any(pushed.any() for pushed in pushes):
@@ -69,7 +69,7 @@ def offsets_from_slots(mission: Mission, way: list[PlannedPhase]) -> list[Floats
     return by_phase
 
 
-def _unknown_accelerations(mission: Mission, planned: PlannedPhase) -> Floats:
+def _unmodelled_accelerations(mission: Mission, planned: PlannedPhase) -> Floats:
     """Acceleration (K, N, 3) [m/s^2] by forces that no law knows."""
     d, v, mass = mission.disturbances, planned.velocity, mission.fleet.mass[:, None]
     up = np.array([0.0, 0.0, 1.0])

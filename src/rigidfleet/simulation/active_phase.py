@@ -14,7 +14,7 @@ from rigidfleet.kernel.problem import OPEN, TRACKING, Problem, Workspace
 from rigidfleet.kernel.records import IntegratorState, Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Settle
-from rigidfleet.planning.disturbances import drop_lost
+from rigidfleet.planning.disturbances import without_lost
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.simulation.callbacks import (
@@ -284,7 +284,7 @@ class ActivePhase:
         if own:
             return plan.problem
         mu = plan.problem.law.mu
-        held = drop_lost(problem, kept, self.lost, mu, large=plan.is_large)
+        held = without_lost(problem, kept, self.lost, mu, large=plan.is_large)
         self.held = held._replace(graph=plan.problem.graph)
         return self.held
 

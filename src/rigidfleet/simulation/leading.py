@@ -124,7 +124,7 @@ class Leader:
         h = end - t
         acts = self._can_lead(t + h)
         self.clock.set_aim(
-            *(self._clock_aim(t, a) if acts and self.settings.clock else (1.0, np.inf))
+            *(self._clock_rate(t, a) if acts and self.settings.clock else (1.0, np.inf))
         )
         accelerations = (
             self._detour_accels(t, a) if acts and self.settings.body else self.deviation.decay()
@@ -179,7 +179,7 @@ class Leader:
         reference = self.problem.reference
         return reference.kind != SQUARED or t - self.clock.delay >= reference.t0 + reference.T_b
 
-    def _clock_aim(self, t: float, a: AvoidanceArrays) -> tuple[float, float]:
+    def _clock_rate(self, t: float, a: AvoidanceArrays) -> tuple[float, float]:
         """The rate to aim at, and the bandwidth of the clock.
 
         The greatest one at which the slots keep away from all that moves, as far as it is known, over the horizon; if

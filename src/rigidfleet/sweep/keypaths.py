@@ -60,7 +60,7 @@ def expand_path(whole: Mapping[str, Any], path: str) -> list[Keys]:
 
 def whole_document(mission: Mission) -> dict[str, Any]:
     """A mission as plain data with all defaults; None for optional keys without a value."""
-    return _with_defaults(mission, mission.n_agents)
+    return _plain_document(mission, mission.n_agents)
 
 
 def replace_value(
@@ -111,7 +111,7 @@ def description_of(mission: Mission, keys: Keys) -> str:
     return text
 
 
-def _with_defaults(value: Any, n: int, field: FieldInfo | None = None) -> Any:
+def _plain_document(value: Any, n: int, field: FieldInfo | None = None) -> Any:
     """Plain data of a value with all defaults, of a key with a type, in a mission of n agents."""
     kind = None if field is None else field.annotation
     if value is None and (model := model_of(kind)):
@@ -119,7 +119,7 @@ def _with_defaults(value: Any, n: int, field: FieldInfo | None = None) -> Any:
         return Absent(
             (
                 k,
-                _with_defaults(
+                _plain_document(
                     None if f.is_required() else f.get_default(call_default_factory=True), n, f
                 ),
             )
@@ -129,11 +129,11 @@ def _with_defaults(value: Any, n: int, field: FieldInfo | None = None) -> Any:
         return next(([value] * (count or n) for listed, count in _LISTS if listed == kind), value)
     if isinstance(value, Part):
         return {
-            k: _with_defaults(getattr(value, k), n, f) for k, f in type(value).model_fields.items()
+            k: _plain_document(getattr(value, k), n, f) for k, f in type(value).model_fields.items()
         }
     if isinstance(value, Mapping):
-        return {key: _with_defaults(inner, n) for key, inner in value.items()}
-    return [_with_defaults(v, n) for v in value] if isinstance(value, tuple | list) else value
+        return {key: _plain_document(inner, n) for key, inner in value.items()}
+    return [_plain_document(v, n) for v in value] if isinstance(value, tuple | list) else value
 
 
 def _best_matches(whole: Mapping[str, Any], steps: list[str]) -> tuple[list[tuple[Keys, Any]], int]:

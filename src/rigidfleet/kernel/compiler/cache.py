@@ -35,7 +35,7 @@ def cache_directory() -> Path:
     OSError
         The folder cannot be created, or others could write into it; ``strerror`` says where, and what to do.
     """
-    folder = _folder_from_environ()
+    folder = _kernel_cache_folder()
     if not folder.is_absolute():
         why = "the path is not absolute" if folder.parts[0] != "~" else "there is no home folder"
         raise FileNotFoundError(errno.ENOENT, why)
@@ -47,7 +47,7 @@ def cache_directory() -> Path:
     return folder
 
 
-def _folder_from_environ() -> Path:
+def _kernel_cache_folder() -> Path:
     """The folder named by the environment."""
     bases = (os.environ.get(x) for x in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "LOCALAPPDATA"))
     base = next(filter(None, bases), "~/.cache")
@@ -98,7 +98,7 @@ def warn_not_cached(error: OSError) -> None:
     if not warned.is_set():
         warned.set()
         warnings.warn(
-            f"the compiled flight kernel cannot be cached in {_folder_from_environ()}: {error.strerror or error}. Every"
+            f"the compiled flight kernel cannot be cached in {_kernel_cache_folder()}: {error.strerror or error}. Every"
             " process compiles it again, which takes about half a minute. Set NUMBA_CACHE_DIR to a folder that only you"
             " can write",
             RuntimeWarning,

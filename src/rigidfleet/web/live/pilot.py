@@ -385,9 +385,9 @@ class Pilot:
         room, _, _ = self._clearances(slots, target.r[None, None], target.attitude)
         least = min(float(room[0]), 0.0)
 
-        def blocking_obstacle_name(path: Floats, T: Floats) -> str:
+        def blocking_obstacle_name(path: Floats, attitude: Floats) -> str:
             """What a slot would be deeper in somewhere on a path (K, 3), "" for nothing."""
-            after, _, which = self._clearances(slots, path[:, None], T)
+            after, _, which = self._clearances(slots, path[:, None], attitude)
             return "" if (after >= least).all() else self.at_rest[which[int(after.argmin())]].name
 
         turned = target.euler + h * target.turn
