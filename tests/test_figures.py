@@ -355,6 +355,15 @@ def overlap(a: np.ndarray, b: np.ndarray) -> bool:
     return True
 
 
+@pytest.mark.parametrize("name", ["inputs", "clearance", "operation"])
+def test_words_stand_above_names_of_phases(name):
+    """Limits and worst values stand above the names of the phases, however high the axes are."""
+    long = "a name with letters that hang"
+    figure = drawn(name, a_flight(phases=[(long, 10.0), (f"{long}, too", 10.0)]))
+    assert by_gid(figure, "phase")
+    assert not covering(figure)
+
+
 LENGTHS = {
     "two": [6.0, 14.0],
     "twelve as in the paper": [6, 9, 9, 8, 8, 10, 4, 3, 8, 10, 4, 11],
@@ -591,6 +600,17 @@ def test_what_stands_still_is_told_in_words(triangle):
     assert not any("m throughout" in text for text in texts(plotting.cm(moving)))
 
 
+def test_axes_of_the_summary_stand_where_they_are():
+    """Axes over time stand in the same places whatever their numbers, below each other."""
+    small, large = (a_flight(samples=31, thrust=np.full((31, 3), x)) for x in (1.5, 12345.5))
+    places = [
+        [ax.get_position().bounds for ax in drawn("summary", f).axes[2:]] for f in (small, large)
+    ]
+    assert places[0] == places[1]
+    lengths, *_, apart = places[0]
+    assert lengths[0] == apart[0]
+
+
 def test_the_key_of_the_summary_reads_as_words():
     """Phases without names are told by kind, not "1 establish 1", and a dot parts each from the next."""
     phases = [("establish 1", 6.0), ("WP0: clear the ground", 7.0), ("fly 3", 7.0)]
@@ -772,6 +792,28 @@ def test_a_formation_shows_its_graph(n, formation):
     assert len(by_gid(figure, "body-axis")) == (0 if formation is CHAIN else 3)
 
 
+@pytest.mark.parametrize("shape", ["v", "line", "polygon"])
+def test_nothing_covers_a_formation(shape):
+    """Names of body axes and the legend stand beside agents and the lengths of edges."""
+    figure = drawn("formations", a_flight(n=7, formation={"shape": shape, "size": 3.0}))
+    agents = [by_gid(figure, f"agent-{k}")[0].get_window_extent() for k in range(1, 8)]
+    names = [x.get_window_extent() for x in by_gid(figure, "body-axis")]
+    assert len(names) == 3
+    for box in [*names, *(x.get_window_extent() for x in figure.legends)]:
+        assert not any(box.overlaps(agent) for agent in agents)
+
+
+def test_names_of_axes_stand_off_their_numbers():
+    """In a long and flat scene too, the name of an axis in space covers none of its numbers."""
+    flight = a_flight()
+    place = flight.position * [3.0, 0.4, 0.3]
+    figure = drawn("trajectory", replace(flight, position=place, cm=place.mean(axis=1)))
+    for axis in (figure.axes[0].xaxis, figure.axes[0].yaxis):
+        name = corners(axis.label)
+        numbers = [corners(tick.label1) for tick in axis.get_major_ticks()]
+        assert not any(overlap(name, number) for number in numbers)
+
+
 def test_a_graph_without_slots_is_spread_out():
     """A chain of four distances is drawn as a line: each shortest path as long as it is."""
     result = a_flight(n=4, formation=CHAIN)
@@ -779,6 +821,15 @@ def test_a_graph_without_slots_is_spread_out():
     assert not placed
     np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), 4.0, atol=1e-6)
     assert np.linalg.norm(places[0] - places[3]) == pytest.approx(12.0)
+
+
+@pytest.mark.parametrize("edges", [True, False])
+def test_errors_are_named_by_what_is_drawn(edges):
+    """Where slots alone hold a formation, its figure of errors speaks of no edge."""
+    flight = a_flight(formation=TRIANGLE if edges else TRIANGLE | {"edges": []})
+    words = " ".join(texts(drawn("constraint_error", flight)))
+    assert ("edge" in words or "Constraint" in words) == edges
+    assert "error of all pairs" in words
 
 
 def test_every_formation_of_the_mission_is_drawn():

@@ -19,7 +19,7 @@ from rigidfleet.assessment.verdict import Extreme
 from rigidfleet.cli.app import main
 from rigidfleet.errors import ResultError
 from rigidfleet.mission import Mission
-from rigidfleet.reporting import gains, report, report_page
+from rigidfleet.reporting import gains, overlay, report, report_page
 from rigidfleet.reporting.contents import page_contents
 from rigidfleet.result import Result
 from rigidfleet.simulation.flight import simulate
@@ -198,6 +198,26 @@ def test_vehicles_with_rotors(calm, quick):
     assert "flown by points" in both
     assert "force of the rotor that comes nearest to its limit" in both
     assert "rotor" not in Page(report_page(calm)).text
+
+
+def test_words_for_nothing_may_wrap():
+    """A sentence that stands for a worst value is in a column of words: it leaves the others their width."""
+    text = TOML.replace("separation = 1.0", "separation = 1.0\nseparation_below = 1.0")
+    page = page_contents([simulate(Mission.from_toml(text))], None, None)
+    table = page["safety"]
+    (row,) = (cells for cells in table.cell_texts if cells[0].startswith("separation below"))
+    (column,) = (k for k, cell in enumerate(row) if cell == "no agent flies below another")
+    assert table.columns[column][2]
+
+
+def test_legends_of_several_flights_are_whole(calm, hasty):
+    """Names of flights are not cut, and long ones stand below each other within the page."""
+    labels = [f"flights/with a name of its own and more/{k}" for k in range(2)]
+    for draw in (overlay.svg_of_paths, overlay.svg_of_time_curves):
+        root = ET.fromstring(draw([calm, hasty], labels))
+        rows = [str(e.get("transform")) for e in root.iter() if e.text in labels]
+        assert len(rows) == 2
+        assert len({row.split("(")[1].split(" ")[0] for row in rows}) == 1, rows
 
 
 def test_side_by_side(calm, hasty, quick):

@@ -9,6 +9,7 @@ Exit codes
   they passed or failed, and one at least has a verdict; for `tune`: gains are chosen, perhaps the mission's own
 - 1: the flight failed its verdict or ended early; for `check`: the flight will fail
 - 2: invalid input, or files that cannot be read or written; for `sweep`: no run has a verdict
+- 3: undecided: what was measured leaves the verdict in doubt
 - 130: interrupted (Ctrl-C); the flight so far is saved, marked incomplete
 
 Packages that load slowly are imported only by the commands that need them.
@@ -51,7 +52,7 @@ app = App(
     name="rigidfleet",
     help="Fly many air vehicles as one rigid body: simulate, judge and draw formation flights.",
     help_epilogue="Exit codes: 0 success, the flight passed; 1 the flight failed its verdict, or "
-    "will fail (check); 2 invalid input; 130 interrupted, the flight so far is saved.",
+    "will fail (check); 2 invalid input; 3 undecided (a log); 130 interrupted, the flight so far is saved.",
     help_format="plaintext",
     version=f"rigidfleet {__version__}",
     version_flags=["--version"],

@@ -93,6 +93,8 @@ def check(
             console.print_json({"mission": mission, "right": True} | home.data())
         else:
             console.print_sheet(home.facts())
+            if out is not None:
+                console.out().print(f"\nAborts   {out}", soft_wrap=True)
         return PASSED
     from rigidfleet.preflight.check import check as preflight
 

@@ -95,13 +95,12 @@ def report(
         console.print_json(verdict_data if others else verdict_data[0])
     make_folder(files.folder)
     if others:
-        labels = labels_of(paths, records)
-        if not (json or quiet):
-            for label, verdict in zip(labels, verdicts, strict=True):
-                console.out().print(f"{label}: {verdict.summary}", soft_wrap=True)
+        labels = labels_of(paths)
         write_report(records, verdicts, page, quiet=quiet, labels=labels)
         if not (json or quiet):
-            console.out().print(f"\nReport   {page}", soft_wrap=True)
+            for label, verdict in zip(labels, verdicts, strict=True):
+                console.out().print(f"{label}: {verdict.summary}")
+            console.out().print(f"\nReport   {page} (open it in a browser)", soft_wrap=True)
     else:
         console.show_verdict(verdicts[0], quiet=json or quiet)
         drawn = [] if no_figures else files.list_figure_paths(figures, format or DRAWN)
@@ -140,7 +139,7 @@ def replay(result: Path, /, *, out: Path | None = None, force: bool = False) -> 
     page = out or Files(result.parent, record.mission.name).replay
     refuse_overwriting(page, force=force)
     write_replay(record, page)
-    console.out().print(f"Replay   {page}", soft_wrap=True)
+    console.out().print(f"Replay   {page} (open it in a browser)", soft_wrap=True)
     return PASSED
 
 
@@ -235,9 +234,9 @@ def _name_and_digest_text(path: Path) -> str:
     return f"{path.name}, SHA-256 {sha256(path.read_bytes()).hexdigest()}"
 
 
-def labels_of(paths: list[Path], records: list[Result]) -> list[str]:
-    """Short labels that distinguish several flights."""
-    missions = [record.mission.name for record in records]
-    stems = [path.stem for path in paths]
-    folders = [str(path.parent / path.stem) for path in paths]
-    return next((names for names in (missions, stems) if len({*names}) == len(names)), folders)
+def labels_of(paths: list[Path]) -> list[str]:
+    """Short labels that distinguish several flights: names of files, of folders, or both."""
+    files = [path.stem for path in paths]
+    folders = [path.absolute().parent.name for path in paths]
+    both = [str(path.parent / path.stem) for path in paths]
+    return next((names for names in (files, folders) if len({*names}) == len(names)), both)

@@ -357,7 +357,7 @@ def shape_error(result: Result) -> Floats:
 
 def draw_constraint_error(ax: Axes, result: Result) -> list[Line2D]:
     """Draw the errors |c| of the edges, the greatest, and that of all pairs; return legend entries of the last two."""
-    ax.set_ylabel("error |c| of an edge [m]")
+    ax.set_ylabel("error |c| of an edge [m]" if has_edges(result) else "error of all pairs [m]")
     size, shape = np.abs(result.constraint), shape_error(result)
     handles = []
     if np.isfinite(shape).any():
@@ -388,8 +388,8 @@ def draw_constraint_error(ax: Axes, result: Result) -> list[Line2D]:
 @st.styled_figure(lambda result: has_edges(result) or result.mission.formations)
 def constraint_error(result: Result) -> Figure:
     """Constraint error |c| of each edge (length minus reference), and shape error of all pairs."""
-    title = "Constraint error, and shape error of all pairs against the slots"
-    fig, axes = st.time_figure(result, title, 1, height=3.6)
+    title = "Constraint error, and shape error" if has_edges(result) else "Shape error"
+    fig, axes = st.time_figure(result, f"{title} of all pairs against the slots", 1, height=3.6)
     ax = axes[0, 0]
     if handles := draw_constraint_error(ax, result):
         st.draw_legend(ax, [*handles, *(edge_handles(result) if len(result.edges) else [])])

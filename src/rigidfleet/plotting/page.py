@@ -28,8 +28,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
     """Three Euler angles in one axes, dark to light; without an attitude, the constraint error."""
     flown, wanted, _ = curves.flown_and_wanted_euler(result)
     if not np.isfinite(flown).any():
-        entries = curves.draw_constraint_error(ax, result)
-        if entries:
+        if entries := curves.draw_constraint_error(ax, result):
             _legend_above(ax, entries)
         return
     ax.set_ylabel("attitude [deg]")
@@ -55,8 +54,8 @@ def summary(result: Result) -> Figure:
     view = space.trajectory_scene(result)
     space.draw_trajectory_in_space(fig, result, view, (0.0, 0.49, 0.41, 0.47))
     space.draw_trajectory_from_above(fig.add_axes((0.475, 0.575, 0.195, 0.345)), result, view)
-    lengths = fig.add_axes((0.73, 0.575, 0.255, 0.33))
-    angles, thrust, apart = (fig.add_axes((x, 0.165, 0.27, 0.275)) for x in (0.05, 0.385, 0.715))
+    lengths = fig.add_axes((0.73, 0.575, 0.257, 0.315))
+    angles, thrust, apart = (fig.add_axes((x, 0.165, 0.257, 0.275)) for x in (0.06, 0.395, 0.73))
     over_time = (lengths, angles, thrust, apart)
     for ax in over_time:
         st.draw_time_axis(ax, result)
@@ -73,10 +72,6 @@ def summary(result: Result) -> Figure:
     _draw_attitude(angles, result)
     curves.draw_thrust(thrust, result)
     curves.draw_least(apart, result, "clearance" if result.mission.obstacles else "separation")
-    for ax in over_time:  # numbers wider than 0.046 of the page move the left end of their axes
-        box, place = ax.yaxis.get_tightbbox(), ax.get_position()
-        place.x0 += 0.0 if box is None else max(place.x0 - 0.046 - box.x0 / fig.bbox.width, 0.0)
-        ax.set_position(place)
     entries = space.trajectory_legend_entries(result, view)
     fig.legend(
         handles=entries, loc="lower center", ncols=math.ceil(len(entries) / (1 if len(entries) <= 10 else 2)),

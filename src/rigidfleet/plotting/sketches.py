@@ -62,14 +62,14 @@ def tiled_figure(n: int, above: float, below: float) -> tuple[Figure, list[Axes]
 def formations(result: Result) -> Figure:
     """Formations with their edges and body axes."""
     names = list(result.mission.formations)
-    legend = len(result.edges) > curves.SINGLE
-    fig, axes = tiled_figure(len(names), 0.4, 0.7 * legend)
+    entries = curves.edge_handles(result) if len(result.edges) > curves.SINGLE else []
+    columns = max(min(len(names) + 1, 4, len(entries)), 1)
+    below = 0.3 * bool(entries) + 0.2 * math.ceil(len(entries) / columns)
+    fig, axes = tiled_figure(len(names), 0.4, below)
     st.draw_flight_heading(fig, result, "Formations with their body axes")
     for ax, name in zip(axes, names, strict=True):
         _draw_formation(ax, result, name)
-    if legend:
-        entries = curves.edge_handles(result)
-        columns = min(int(fig.get_figwidth() / 2.2), len(entries))
+    if entries:
         fig.legend(handles=entries, loc="lower center", ncols=columns, borderaxespad=0.8)
     return fig
 
@@ -86,7 +86,8 @@ def _draw_formation(ax: Axes, result: Result, name: str) -> None:
     drawn = draw_formation_sketch(ax, mission, name, of_edge, words, most=curves.SINGLE)
     if drawn.placed and mission.n_agents > 1 and not mission.formation_colours(name):
         share = (0.3, 0.3, 0.42, 0.5)[distance_geometry.dimension(drawn.p, 1e-3)]
-        _draw_body_axes(ax, drawn.turn.T, share * float(np.linalg.norm(drawn.p, axis=1).max()))
+        length = share * float(np.linalg.norm(drawn.p, axis=1).max())
+        _draw_body_axes(ax, drawn.turn.T, length, (drawn.p @ drawn.turn.T)[:, :2])
 
 
 class Sketch(NamedTuple):
@@ -212,11 +213,15 @@ def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str], shown: Seque
     ax.scatter(*p[order, :2].T, s=2000 / len(p) + 1, c=dots[order], linewidths=0, zorder=3)
 
 
-def _draw_body_axes(ax: Axes, axes: Floats, length: float) -> None:
+def _draw_body_axes(ax: Axes, axes: Floats, length: float, agents: Floats) -> None:
     """Draw body axes from the centre of mass; rows of `axes` (3, 3), the last column towards the viewer.
 
-    One that points to the viewer is a ring with a dot, beside the centre, where an agent may be.
+    One that points to the viewer is a ring with a dot, beside the centre, where an agent may be. The names of others
+    stand before or beside their tips, where agents (N, 2) and lengths of edges are farthest.
     """
+    lengths = [x.get_position() for x in ax.texts if x.get_transform() == ax.transData]
+    taken = np.concatenate([agents, np.reshape(lengths, (-1, 2))])
+    beside = 0.13 * float(np.ptp(ax.get_xlim())) / 2
     look: dict[str, Any] = {
         "ha": "center", "va": "center", "zorder": 7, "fontsize": 9.5, "gid": "body-axis",
         "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8},
@@ -227,4 +232,7 @@ def _draw_body_axes(ax: Axes, axes: Floats, length: float) -> None:
             continue
         arrow = {"arrowstyle": "-|>", "color": st.INK, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 0}
         ax.annotate("", (x, y), (0, 0), zorder=4, arrowprops=arrow)
-        ax.annotate(label, (1.1 * x, 1.1 * y), **look)
+        across = beside * np.array([-y, x]) / np.hypot(x, y)
+        places = [np.array([x, y]) * 1.1, [x, y] + across, [x, y] - across]
+        least = [np.linalg.norm(taken - place, axis=1).min() for place in places]
+        ax.annotate(label, places[int(np.argmax(np.minimum(least, 1.3 * beside)))], **look)

@@ -267,6 +267,11 @@ def _fit_axes(
     extent = np.ptp(_screen_positions(ax, box_corners(view.low, view.high)), axis=0)
     zoom = min((width - 2 * margin) / extent[0], (height - 2 * margin) / extent[1])
     ax.set_box_aspect([float(s) for s in view.high - view.low], zoom=zoom)
+    # Names stand off their numbers by a share of the box, which is too little where it is thin: by 20 points at least.
+    corners = _screen_positions(ax, box_corners(view.low, view.high))
+    for axis, k in ((ax.xaxis, 2), (ax.yaxis, 4)):
+        across = np.linalg.norm([corners[k] - corners[1], corners[k + 1] - corners[0]], axis=1)
+        axis.labelpad = max(10.4 * side / float(across.max()) - 14.0, 0.0)
 
 
 # -- from above --------------------------------------------------------------------------------------

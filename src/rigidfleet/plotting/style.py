@@ -267,7 +267,7 @@ def write_above(ax: Axes, words: str, colour: str = INK) -> None:
     letters = int(_LETTERS * ax.bbox.width / _DPI)
     over_phases = any(text.get_gid() == "phase" for text in ax.texts)
     ax.set_title(
-        textwrap.fill(whole, letters, break_on_hyphens=False), loc="right", pad=13.0 if over_phases else 3.0,
+        textwrap.fill(whole, letters, break_on_hyphens=False), loc="right", pad=17.0 if over_phases else 3.0,
         fontsize=7.5, color=colour, fontweight="normal", parse_math=False, gid="words",
     )  # fmt: skip
 
@@ -372,17 +372,22 @@ def draw_legend(ax: Axes, handles: Sequence[Any], title: str = "") -> None:
     look: dict[str, Any] = {"bbox_to_anchor": (1.012, 1.0)}
     if is_narrow():  # clear of the numbers and the name of the time axis, which the last axes has
         last = (spec := ax.get_subplotspec()) is None or spec.is_last_row()
-        longest = max((len(str(h.get_label())) for h in handles), default=1)
         look = {
             "bbox_to_anchor": (0, 0),
             "borderaxespad": 4.5 if last else 0.8,
-            "ncols": max(int(16 * (figure_width(WIDTH) - 0.7)) // (longest + 7), 1),
+            "ncols": legend_columns(handles),
         }
     if handles:
         ax.legend(
             handles=handles, loc="upper left", title=title or None, title_fontsize=8, alignment="left",
             labelspacing=0.3, **look,
         )  # fmt: skip
+
+
+def legend_columns(handles: Sequence[Any]) -> int:
+    """Number of columns of a legend below a figure over time, in which no entry is cut."""
+    longest = max((len(str(h.get_label())) for h in handles), default=1)
+    return max(int(16 * (figure_width(WIDTH) - 0.7)) // (longest + 7), 1)
 
 
 # -- names of phases ---------------------------------------------------------------------------------

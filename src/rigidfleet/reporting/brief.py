@@ -50,16 +50,16 @@ def plan_sentences(result: Result) -> list[str]:
     lasting = value(float(result.time[-1] - result.time[0]), "s")
     count = Counter(mission.vehicles[name].model for name in mission.agents.vehicle)
     what = ", ".join(f"{n} × {name}" for name, n in count.items())
-    what += f"{', ' * bool(count)}{mass[0]:.4g}{f' to {mass[-1]:.4g}' * (len(mass) > 1)} kg"
+    what += f"{', ' if count else 'Mass '}{mass[0]:.4g}{f' to {mass[-1]:.4g}' * (len(mass) > 1)} kg"
     phases = ", ".join(dict.fromkeys(phase.name for phase in result.phases))
     made_by_others = result.interpolation is not None
     how = f", as others planned it: {result.interpolation}" if made_by_others else f": {phases}"
     edges = {name: len(mission.formation_edges(name)) for name in mission.formations}
-    held = ", ".join(f"{name} ({n} edges)" for name, n in edges.items() if n)
+    held = ", ".join(f"{name} ({n} edge{'s' * (n != 1)})" for name, n in edges.items() if n)
     fastest = result.extreme("speed")
     ends = "" if made_by_others else f"{what}. "
-    ends += f"They reach up to {value(float(np.nanmax(result.position[..., 2])), 'm')}"
-    ends += "" if fastest is None else f" and {value(fastest.value, 'm/s')}"
+    ends += f"Greatest height {value(float(np.nanmax(result.position[..., 2])), 'm')}"
+    ends += "" if fastest is None else f", greatest speed {value(fastest.value, 'm/s')}"
     ends += f". Distances are held in {held}" * bool(held)
     number = "One vehicle flies" if result.n_agents == 1 else f"{result.n_agents:,} vehicles fly"
     return [f"{number} for {lasting}{how}.", f"{ends}."]

@@ -233,7 +233,7 @@ def _nothing_to_measure_text(name: str) -> str:
 def _safety_cells(row: Safety) -> tuple[str | Cell, ...]:
     """Limit, worst value, margin, when and who."""
     if (worst := row.worst) is None:
-        return row.fact.bound, _nothing_to_measure_text(row.quantity), "", "", ""
+        return row.fact.bound, "", _nothing_to_measure_text(row.quantity), "", ""
     left = ""
     if row.margin is not None:
         left = f"{value(abs(row.margin), row.unit)} {'left' if row.margin >= 0 else 'beyond'}"
@@ -247,9 +247,9 @@ def _safety_cell(name: str, row: Safety | None) -> Cell:
     """The worst value of one of several flights, with its limit, whom and when."""
     if row is None:
         return Cell(_nothing_to_measure_text(name))
-    limit, worst, _, when, who = _safety_cells(row)
+    limit, worst, margin, when, who = _safety_cells(row)
     small = ", ".join(str(x) for x in (limit, who, getattr(when, "text", "")) if x)
-    return Cell(str(worst), small, level=_safety_level(row))
+    return Cell(str(worst or margin), small, level=_safety_level(row))
 
 
 # -- what differs ------------------------------------------------------------------------------------
@@ -293,11 +293,11 @@ def _mean_thrust(result: Result) -> float | None:
 
 def _change_text(first: float | None, x: float | None) -> str:
     """Change of a number from that of the first flight, if it is meaningful."""
-    if first is None or x is None or abs(first) < 1e-6:
+    if first is None or x is None or abs(first) < 1e-6 or x / first < 0:
         return ""
     percent = 100 * (x - first) / abs(first)
     if abs(percent) >= 300:
-        return f"×{x / first:.2g}" if 0 < x / first < 100 else ""
+        return f"×{x / first:.2g}" if x / first < 100 else ""
     return f"{percent:+.0f} %".replace("-", "−") if abs(percent) >= 0.5 else ""
 
 

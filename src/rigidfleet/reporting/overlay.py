@@ -33,7 +33,7 @@ def svg_of_paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
         above.margins(0.05)
         height.set(xlabel="time [s]", ylabel="z [m]", title="height of the centre of mass")
         _add_flights_legend(fig, flights, labels)
-        return _svg_of_figure(fig)
+        return encode_figure(fig, ["svg"])["svg"]
 
 
 def svg_of_time_curves(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
@@ -67,7 +67,7 @@ def svg_of_time_curves(flights: Sequence[Result], labels: Sequence[str]) -> byte
             ax.set_xlabel("time [s]")
             ax.tick_params(labelbottom=True)
         _add_flights_legend(fig, flights, labels)
-        return _svg_of_figure(fig)
+        return encode_figure(fig, ["svg"])["svg"]
 
 
 def _line_looks(flights: Sequence[Result]) -> list[dict[str, Any]]:
@@ -79,9 +79,5 @@ def _line_looks(flights: Sequence[Result]) -> list[dict[str, Any]]:
 
 def _add_flights_legend(fig: Figure, flights: Sequence[Result], labels: Sequence[str]) -> None:
     looks = zip(labels, _line_looks(flights), strict=True)
-    handles = [st.legend_entry(st.clean_name(label), **look) for label, look in looks]
-    fig.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4))
-
-
-def _svg_of_figure(fig: Figure) -> bytes:
-    return encode_figure(fig, ["svg"])["svg"]
+    handles = [st.legend_entry(st.clean_name(label, 60), **look) for label, look in looks]
+    fig.legend(handles=handles, loc="outside lower center", ncols=st.legend_columns(handles))

@@ -267,7 +267,6 @@ export class Player {
       element("dd", part("help-list"), {}, deed);
     }
     this.look(info.camera);
-    part("more").setAttribute("aria-pressed", String(part("panel").offsetWidth > 0));
   }
 
   speeds() {
@@ -453,7 +452,6 @@ export class Player {
     const panel = part("panel"), hidden = getComputedStyle(panel).display === "none";
     panel.classList.toggle("asked", hidden);
     panel.classList.toggle("dismissed", !hidden);
-    part("more").setAttribute("aria-pressed", String(hidden));
     this.resize();
   }
 
@@ -482,8 +480,10 @@ export class Player {
     document.documentElement.style.setProperty("--bar", `${part("bar").offsetHeight}px`);
     const below = part("fly")?.offsetHeight && width <= 760 ? part("fly").offsetHeight + 14 : 0;
     const left = beside("fly"), right = beside("panel"), bottom = part("bar").offsetHeight + 14 + below;
-    camera.centre = [(left - right) / width, bottom / height];
-    camera.free = [1 - (left + right) / width, 1 - bottom / height];
+    const top = width <= 760 ? part("head").offsetHeight + 14 : 0; // which takes half of a narrow page
+    camera.centre = [(left - right) / width, (bottom - top) / height];
+    camera.free = [1 - (left + right) / width, Math.max(1 - (bottom + top) / height, 0.2)];
+    part("more").setAttribute("aria-pressed", String(part("panel").offsetWidth > 0));
     this.redraw();
     this.stale = true;
   }
