@@ -303,6 +303,37 @@ def test_vehicles_of_which_no_origin_is_known_are_compared_on_the_earth(tmp_path
     assert at_samples(read_trajectories(parts[0]))[1][-1, 1] == pytest.approx(4.9)  # alone
 
 
+def test_places_on_the_earth_are_about_the_origin_of_the_mission(tmp_path, capsys, monkeypatch):
+    """A vehicle beside its fence fails it, by its mission, by the result of that, and in a drill alike."""
+    monkeypatch.chdir(tmp_path)
+    rows = [
+        (1_700_000_000_000_000 + 100_000 * k, 1, 1, "global_position_int",
+         (100 * k, 470_000_000, 80_000_000 + 10 * k, 402_000, 0, 100, 0, 0, 65_535))
+        for k in range(50)
+    ]  # fmt: skip
+    log = telemetry(Path("flight.tlog"), rows)
+    plan = rf.Mission.from_dict({
+        "schema_version": 1, "name": "plan",
+        "geodetic_origin": {"latitude_deg": 47.0, "longitude_deg": 8.00002, "altitude": 400.0},
+        "agents": {"mass": 1.0, "radius": 0.1, "position": [[0.0, 0.0, 2.0]]},
+        "fences": [{"kind": "inclusion", "name": "yard", "polygon": [[-0.5, -9], [9, -9], [9, 9], [-0.5, 9]]}],
+        "phases": [{"kind": "hold", "control": "open", "duration": 4.9}],
+    })  # fmt: skip
+    Path("plan.toml").write_text(plan.text)
+    rf.simulate(plan).save("plan.nc")
+    Path("drill.toml").write_text(f'mission = "plan.toml"\n[drill]\nfiles = ["{log}"]\n')
+    words = "agent 1 crosses the fence 'yard' by 1.0"
+    for judge in (
+        ["plan.toml", str(log)],
+        ["plan.nc", str(log)],
+        [str(log), "--mission", "plan.toml"],
+    ):
+        assert main(["assess", *judge, *["--noise", "0.001"][: 2 * (len(judge) < 3)]]) == 1
+        assert words in " ".join(capsys.readouterr().out.split()), judge
+    assert main(["sweep", "drill.toml", "--quiet"]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_receiver_without_a_fix_tells_no_place(tmp_path):
     """Places count from a fix in three dimensions on, in MAVLink's messages and in PX4's."""
     fixes = [(1_700_000_000_000_000 + 200_000 * k, 1, 1, "gps_raw_int",

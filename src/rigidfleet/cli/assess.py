@@ -113,6 +113,7 @@ def assess(
     """
     from rigidfleet.assessment import assess as judge
     from rigidfleet.mission import as_mission
+    from rigidfleet.result import Result
 
     if not files:
         raise RigidfleetError("no file was given; give a result or trajectories to judge")
@@ -131,8 +132,6 @@ def assess(
             " its flight behind it"
         )
     if alone:
-        from rigidfleet.result import Result
-
         if chosen:
             words = f"--{chosen[0].replace('_', '-')}: no effect on a result, which has its own mission; remove it"
             raise RigidfleetError(words)
@@ -153,10 +152,13 @@ def assess(
                 "--clock: needs a plan to compare clocks with; give a mission before the logs"
             )
         higher = {} if separation_altitude is None else {"separation_altitude": separation_altitude}
-        place = mission if mission is not None else files[0] if plan else None
-        if origin is None and place is not None and Path(place).suffix != ".nc":
-            place = as_mission(str(place)).geodetic_origin
-            options["origin"] = place and (place.latitude_deg, place.longitude_deg, place.altitude)
+        planned: Result | str | None = str(files[0]) if plan else None
+        if plan and files[0].suffix == ".nc":
+            planned = Result.load(files[0])
+        known = planned.mission if isinstance(planned, Result) else planned or mission
+        if origin is None and known is not None:
+            place = as_mission(known).geodetic_origin
+            options["origin"] = place and place.geodetic
         read = read_trajectories(
             files[plan:], **{key: x for key, x in options.items() if key in _READ and x is not None}
         )
@@ -167,7 +169,7 @@ def assess(
             "radius": radius or 0.0, "ground": ground, "name": flight_name(files[0]),
         }  # fmt: skip
         doubts = _stated_doubts(noise, clock) if noise or plan else None
-        result, verdict = _judge(read, files[0] if plan else None, doubts, judged)
+        result, verdict = _judge(read, planned, doubts, judged)
     made = Files(out, result.mission.name) if out is not None else None
     if made is not None:
         made.check_writable(replace=force)
@@ -198,7 +200,7 @@ def _is_plan(file: Path) -> bool:
 
 
 def _judge(
-    read: Trajectories, plan: Path | None, doubts: Doubts | None, judged: dict[str, Any]
+    read: Trajectories, plan: Result | str | None, doubts: Doubts | None, judged: dict[str, Any]
 ) -> tuple[Result, Verdict]:
     """Trajectories that were read as a flight, and the verdict on it; with doubt, if something may be in doubt."""
     from rigidfleet.assessment import assess as judge
@@ -214,13 +216,10 @@ def _judge(
                 "the trajectory looks measured, and is taken as exact: its noise is judged, too. Say --noise"
             )
         return result, verdict
-    from rigidfleet.result import Result
     from rigidfleet.simulation.as_logged import judge_log
     from rigidfleet.simulation.flight import simulate
 
-    planned = None
-    if plan is not None:
-        planned = Result.load(plan) if plan.suffix == ".nc" else simulate(str(plan))
+    planned = simulate(plan) if isinstance(plan, str) else plan
     return judge_log(read, planned, doubts, **judged)
 
 
