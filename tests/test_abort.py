@@ -498,6 +498,30 @@ def test_what_stands_in_the_way_is_named() -> None:
     assert "no way home is proved" in str([x.text for x in rf.check(result.mission).remarks])
 
 
+@pytest.mark.parametrize(
+    ("avoidance", "lands"),
+    [({"clearance": 0.04}, True), ({"clearance": 0.2}, False), ({"margin": 0.2}, False), ({"separation": 1.5}, True)],
+)  # fmt: skip
+def test_ways_home_are_those_that_avoidance_lets_vehicles_fly(
+    avoidance: dict[str, Any], lands: bool
+) -> None:
+    """Where it keeps vehicles off the ground, none lands, and both checks say why; ways home keep its separation."""
+    data = {
+        "schema_version": 1, "name": "kept", "assignment": "each", "smoothness": "jerk", "limits": {"separation": 0.5},
+        "agents": {"vehicle": "q", "radius": 0.1, "position": [[0, 0, 4.0], [2, 0, 4.0], [4, 0, 4.0]]},
+        "vehicles": {"q": {"model": "point", "mass": 1.0, "thrust_limit": 20.0}}, "obstacles": [{"kind": "ground"}],
+        "formations": {"row": {"slots": [[-3, 0, 0], [0, 0, 0], [3, 0, 0]], "edges": []}}, "avoidance": avoidance,
+        "phases": [{"kind": "establish", "formation": "row", "blend": 4.0, "duration": 5.0}],
+    }  # fmt: skip
+    home = aborts_of(complete_times(Mission.from_dict(data))).abort_at(4.0).home
+    assert ("keeps vehicles 0.2 m from the ground" in home.reason) is not lands
+    verdict = rf.assess(rf.simulate(Mission.from_dict(data | {"abort": {"at": 4.0}})))
+    assert verdict.passed is lands, str(verdict)
+    data["phases"].append({"kind": "land", "duration": 8.0})
+    words = [x.text for x in rf.check(Mission.from_dict(data)).remarks if x.topic == "avoidance"]
+    assert any("from the ground" in x for x in words) is not lands
+
+
 def test_what_flies_past_fast_is_seen_between_slow_samples() -> None:
     """A ball of 0.6 m at 30 m/s that crosses the way down of a vehicle leaves it no such way, if it hits it."""
     data = show().to_dict()
