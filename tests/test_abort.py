@@ -442,6 +442,7 @@ def test_an_abort_begins_where_the_vehicles_are_led() -> None:
     """Beside obstacles that move, too, the reference goes on from the plan to the abort without a jump."""
     data = load_mission("moving-obstacles").to_dict()
     data["obstacles"].append({"kind": "ground"})
+    data["avoidance"]["clearance"] = 0.0  # vehicles land
     result = rf.simulate(Mission.from_dict(data | {"abort": {"at": 15.0}}))
     assert result.complete
     slots, begins = result.slot_position, np.flatnonzero(np.diff(result.phase))
@@ -600,6 +601,20 @@ def test_ways_are_made_again_and_not_kept() -> None:
         assert np.array_equal(way.pieces, again.pieces)
         assert way.time[-1] == step.duration
         assert np.array_equal(way.at(way.time[-1:])[0], step.end)
+
+
+@pytest.mark.parametrize(
+    ("reaction", "step", "count"), [(0.0, 7.3, 4), (0.5, 7.3, 5), (0.0, 40.0, 0), (40.0, 1.0, 0)]
+)
+def test_each_abort_that_is_planned_can_be_flown(reaction: float, step: float, count: int) -> None:
+    """Of steps that do not divide the flight, and no others: at once, and later than all that is planned."""
+    mission = show(reaction=reaction, step=step)
+    checked = check_aborts(mission)
+    assert len(checked.aborts) == count
+    assert ("note" in str(checked.facts().parts[-1])) is (count == 0)
+    data = mission.to_dict()
+    for order in [x.ordered for x in checked.aborts]:
+        Mission.from_dict(data | {"abort": data["abort"] | {"at": order}})  # no error
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -590,9 +590,9 @@ class Aborts:
     # -- aborts -------------------------------------------------------------------------------------------
 
     def all_aborts(self) -> Iterator[Abort]:
-        """The abort of each `step` of the flight."""
+        """The abort of each `step` of the flight, on which vehicles act after its start and before its end."""
         end = self.plan_end - self.options.reaction
-        for k in range(1 + max(0, math.floor(end / self.options.step - 1e-9))):
+        for k in range(self.options.reaction == 0.0, math.ceil(end / self.options.step - 1e-9)):
             yield self.abort_at(k * self.options.step)
 
     def abort_at(self, ordered: float) -> Abort:
