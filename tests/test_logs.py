@@ -6,7 +6,7 @@ import re
 import sqlite3
 import struct
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -794,6 +794,30 @@ def test_robots_in_frames_of_their_own_are_not_compared(tmp_path):
     assert read.names == ("/tf:cf1/base", "/tf:cf2/base")
     assert said(read, "positions are in frames enu cf1/odom, enu cf2/odom")
     np.testing.assert_allclose(at_samples(read, 1)[1][:, 0], 0.1 * np.arange(50))
+
+
+def test_parts_of_a_recording_are_read_by_their_folder(log, tmp_path):
+    """Two parts alone are no vehicles of one flight, and the refusal says what is; with it they are the whole."""
+    whole, parts = log("transforms.db3"), []
+    with closing(sqlite3.connect(whole)) as base:
+        times = [t for (t,) in base.execute("SELECT timestamp FROM messages ORDER BY timestamp")]
+    for k, later in enumerate("><"):
+        parts.append(tmp_path / f"part_{k}.db3")
+        parts[k].write_bytes(whole.read_bytes())
+        with closing(sqlite3.connect(parts[k])) as base, base:
+            base.execute(
+                f"DELETE FROM messages WHERE timestamp {later}= ?", (times[len(times) // 2],)
+            )
+    with pytest.raises(TrajectoryError, match=r"by its folder with metadata\.yaml"):
+        read_trajectories(parts)
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    for part in parts:
+        part.rename(folder / part.name)
+    (folder / "metadata.yaml").touch()
+    read = read_trajectories(folder, gaps="bridge")
+    assert read.names == read_trajectories(whole, gaps="bridge").names
+    assert len(read.curves[0].time) > 2
 
 
 def test_frames_that_move_in_each_other_are_refused(tmp_path):

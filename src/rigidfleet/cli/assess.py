@@ -124,19 +124,21 @@ def assess(
     }  # fmt: skip
     chosen = [key for key, value in options.items() if value is not None]
     plan = _is_plan(files[0])
-    alone = plan and len(files) == 1
-    if alone and files[0].suffix != ".nc":
+    planned: Result | str | None = str(files[0]) if plan else None
+    if plan and files[0].suffix == ".nc":
+        planned = Result.load(files[0])
+    alone = len(files) == 1
+    if alone and isinstance(planned, str):
         as_mission(str(files[0]))  # what is wrong with it comes first
         raise RigidfleetError(
             f"{files[0]}: is a mission, and no flight. Fly and judge it by `rigidfleet run {files[0]}`, or give logs of"
             " its flight behind it"
         )
-    if alone:
+    if alone and isinstance(planned, Result):
         if chosen:
             words = f"--{chosen[0].replace('_', '-')}: no effect on a result, which has its own mission; remove it"
             raise RigidfleetError(words)
-        result = Result.load(files[0])
-        verdict = judge(result)
+        result, verdict = planned, judge(planned)
     else:
         from rigidfleet.foreign.files import read_trajectories
 
@@ -152,13 +154,9 @@ def assess(
                 "--clock: needs a plan to compare clocks with; give a mission before the logs"
             )
         higher = {} if separation_altitude is None else {"separation_altitude": separation_altitude}
-        planned: Result | str | None = str(files[0]) if plan else None
-        if plan and files[0].suffix == ".nc":
-            planned = Result.load(files[0])
         known = planned.mission if isinstance(planned, Result) else planned or mission
         if origin is None and known is not None:
-            place = as_mission(known).geodetic_origin
-            options["origin"] = place and place.geodetic
+            options["origin"] = getattr(as_mission(known).geodetic_origin, "geodetic", None)
         read = read_trajectories(
             files[plan:], **{key: x for key, x in options.items() if key in _READ and x is not None}
         )
@@ -258,13 +256,12 @@ def _parse_limits(limits: list[str]) -> dict[str, float]:
     by_key: dict[str, float] = {}
     for option in limits:
         for part in option.split(","):
-            key, equals, value = part.partition("=")
             try:
+                key, value = part.split("=")
                 by_key[key.strip()] = float(value)
             except ValueError:
-                equals = ""
-            if not equals:
-                raise RigidfleetError(f"--limits {part}: give KEY=VALUE, such as speed=3")
+                words = f"--limits {part}: give KEY=VALUE, such as speed=3"
+                raise RigidfleetError(words) from None
     return by_key
 
 

@@ -205,8 +205,7 @@ class Show:
 
         self.mission, self.drill, self.n = mission, drill, mission.n_agents
         self.names: tuple[str, ...] = ()
-        place = mission.geodetic_origin
-        self._origin = place.geodetic if place else None
+        self._origin = getattr(mission.geodetic_origin, "geodetic", None)
         self.curve, self.how, verdict, self.names = self._fly_or_read_ways(mission, drill.files)
         if not verdict.passed:
             why = next(check.message for check in verdict.checks if not check.passed)
