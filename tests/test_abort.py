@@ -442,6 +442,7 @@ def test_an_abort_begins_where_the_vehicles_are_led() -> None:
     """Beside obstacles that move, too, the reference goes on from the plan to the abort without a jump."""
     data = load_mission("moving-obstacles").to_dict()
     data["obstacles"].append({"kind": "ground"})
+    data["avoidance"]["clearance"] = 0.0  # vehicles land
     result = rf.simulate(Mission.from_dict(data | {"abort": {"at": 15.0}}))
     assert result.complete
     slots, begins = result.slot_position, np.flatnonzero(np.diff(result.phase))
@@ -496,6 +497,30 @@ def test_what_stands_in_the_way_is_named() -> None:
     assert not result.complete
     assert "'roof' stands in the way" in result.ending
     assert "no way home is proved" in str([x.text for x in rf.check(result.mission).remarks])
+
+
+@pytest.mark.parametrize(
+    ("avoidance", "lands"),
+    [({"clearance": 0.04}, True), ({"clearance": 0.2}, False), ({"margin": 0.2}, False), ({"separation": 1.5}, True)],
+)  # fmt: skip
+def test_ways_home_are_those_that_avoidance_lets_vehicles_fly(
+    avoidance: dict[str, Any], lands: bool
+) -> None:
+    """Where it keeps vehicles off the ground, none lands, and both checks say why; ways home keep its separation."""
+    data = {
+        "schema_version": 1, "name": "kept", "assignment": "each", "smoothness": "jerk", "limits": {"separation": 0.5},
+        "agents": {"vehicle": "q", "radius": 0.1, "position": [[0, 0, 4.0], [2, 0, 4.0], [4, 0, 4.0]]},
+        "vehicles": {"q": {"model": "point", "mass": 1.0, "thrust_limit": 20.0}}, "obstacles": [{"kind": "ground"}],
+        "formations": {"row": {"slots": [[-3, 0, 0], [0, 0, 0], [3, 0, 0]], "edges": []}}, "avoidance": avoidance,
+        "phases": [{"kind": "establish", "formation": "row", "blend": 4.0, "duration": 5.0}],
+    }  # fmt: skip
+    home = aborts_of(complete_times(Mission.from_dict(data))).abort_at(4.0).home
+    assert ("keeps vehicles 0.2 m from the ground" in home.reason) is not lands
+    verdict = rf.assess(rf.simulate(Mission.from_dict(data | {"abort": {"at": 4.0}})))
+    assert verdict.passed is lands, str(verdict)
+    data["phases"].append({"kind": "land", "duration": 8.0})
+    words = [x.text for x in rf.check(Mission.from_dict(data)).remarks if x.topic == "avoidance"]
+    assert any("from the ground" in x for x in words) is not lands
 
 
 def test_what_flies_past_fast_is_seen_between_slow_samples() -> None:
@@ -576,6 +601,20 @@ def test_ways_are_made_again_and_not_kept() -> None:
         assert np.array_equal(way.pieces, again.pieces)
         assert way.time[-1] == step.duration
         assert np.array_equal(way.at(way.time[-1:])[0], step.end)
+
+
+@pytest.mark.parametrize(
+    ("reaction", "step", "count"), [(0.0, 7.3, 4), (0.5, 7.3, 5), (0.0, 40.0, 0), (40.0, 1.0, 0)]
+)
+def test_each_abort_that_is_planned_can_be_flown(reaction: float, step: float, count: int) -> None:
+    """Of steps that do not divide the flight, and no others: at once, and later than all that is planned."""
+    mission = show(reaction=reaction, step=step)
+    checked = check_aborts(mission)
+    assert len(checked.aborts) == count
+    assert ("note" in str(checked.facts().parts[-1])) is (count == 0)
+    data = mission.to_dict()
+    for order in [x.ordered for x in checked.aborts]:
+        Mission.from_dict(data | {"abort": data["abort"] | {"at": order}})  # no error
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -569,3 +569,12 @@ def test_a_note_names_the_vehicles_of_a_file(names, words, tmp_path):
     rows = [[t, 3.0 * k, t, 2.0, name] for k, name in enumerate(names) for t in (0.0, 1.0, 2.0)]
     verdict, _ = judged(table(tmp_path / "of.csv", rows, f"{HEAD},agent"), separation=0.5)
     assert words in verdict.notes
+
+
+def test_vehicles_with_numbers_for_names_are_in_their_order(tmp_path):
+    """A first row that is lost, or has no position, changes no vehicle's number."""
+    rows = [f"{t},{who},{who}.5,{t},1" for t in range(5) for who in (10, 2, 1)]
+    for first in (rows[:2], ["0,10,,,", "0,2,nan,nan,nan"]):
+        table = tmp_path / "log.csv"
+        table.write_text("\n".join(["time,agent,x,y,z", *first, *rows[3:]]) + "\n")
+        assert read_trajectories(table, spans="stand").names == ("1", "2", "10")

@@ -413,15 +413,23 @@ def test_vehicles_in_another_order_are_told(plan: rf.Result) -> None:
 
 
 def test_a_lost_vehicle_is_not_judged() -> None:
-    """After a planned loss, the others are judged as in the flight itself, and what falls is no part of that."""
+    """A planned loss is judged as in the flight itself: up to it, what falls has no great acceleration."""
     plan = rf.simulate("falling-light")
     log = flown(plan, np.random.default_rng(18))
     _, verdict = judge_log(log, plan, Doubts(SIGMA, 0.0))
     assert not verdict.failures
     for name, own in rf.assess(plan).by_name.items():
-        if name in ("separation", "lost", "clearance", "speed", "waypoint_position"):
+        if name in (
+            "separation",
+            "lost",
+            "clearance",
+            "speed",
+            "acceleration",
+            "waypoint_position",
+        ):
             low, high = verdict.by_name[name].interval or (np.inf, np.inf)
             assert low <= (own.worst or 0.0) <= high, name
+    assert verdict.by_name["acceleration"].passed
 
 
 def test_a_log_whose_last_samples_are_lost_is_complete(plan: rf.Result) -> None:

@@ -418,6 +418,22 @@ def test_polygons_of_geojson(data, polygons, note):
     assert (note is None and not notes) or (note is not None and note in " ".join(notes))
 
 
+def test_parts_of_a_polygon_that_is_cut_are_to_be_joined():
+    """A cut, as at the antimeridian, is no border where vehicles may be beside it: whole, the area holds them."""
+    origin = {"latitude_deg": 0.0, "longitude_deg": 180.0}
+    west, east = (
+        [[a, -1e-3], [b, -1e-3], [b, 1e-3], [a, 1e-3]]
+        for a, b in ((179.999, 180.0), (-180.0, -179.999))
+    )
+    fence = {"kind": "inclusion", "coordinates": [[west], [east]]}
+    with pytest.raises(MissionError, match="join polygons that overlap or adjoin"):
+        rf.Mission.from_dict(beside(geodetic_origin=origin, fences=[fence]))
+    fence["coordinates"] = [[[west[0], east[1], east[2], west[3]]]]
+    (area,) = rf.Mission.from_dict(beside(geodetic_origin=origin, fences=[fence])).fences
+    region = area.region(rf.Mission.from_dict(beside(geodetic_origin=origin)).geodetic_origin, 0.0)
+    assert region.distance(np.zeros((1, 2)))[0] == pytest.approx(-110.57, abs=0.01)
+
+
 def test_an_island_in_a_hole_is_inside():
     """A polygon within the hole of another counts, as it does by the parity of the rings around random points."""
 

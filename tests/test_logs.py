@@ -6,7 +6,7 @@ import re
 import sqlite3
 import struct
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -301,6 +301,37 @@ def test_vehicles_of_which_no_origin_is_known_are_compared_on_the_earth(tmp_path
         np.testing.assert_allclose(apart, [[4.0, 0.0, 0.0]] * 50, atol=0.02)
     assert np.isnan(read.curves[0].at(np.zeros(1))[0, 3])  # a heading that is not known
     assert at_samples(read_trajectories(parts[0]))[1][-1, 1] == pytest.approx(4.9)  # alone
+
+
+def test_places_on_the_earth_are_about_the_origin_of_the_mission(tmp_path, capsys, monkeypatch):
+    """A vehicle beside its fence fails it, by its mission, by the result of that, and in a drill alike."""
+    monkeypatch.chdir(tmp_path)
+    rows = [
+        (1_700_000_000_000_000 + 100_000 * k, 1, 1, "global_position_int",
+         (100 * k, 470_000_000, 80_000_000 + 10 * k, 402_000, 0, 100, 0, 0, 65_535))
+        for k in range(50)
+    ]  # fmt: skip
+    log = telemetry(Path("flight.tlog"), rows)
+    plan = rf.Mission.from_dict({
+        "schema_version": 1, "name": "plan",
+        "geodetic_origin": {"latitude_deg": 47.0, "longitude_deg": 8.00002, "altitude": 400.0},
+        "agents": {"mass": 1.0, "radius": 0.1, "position": [[0.0, 0.0, 2.0]]},
+        "fences": [{"kind": "inclusion", "name": "yard", "polygon": [[-0.5, -9], [9, -9], [9, 9], [-0.5, 9]]}],
+        "phases": [{"kind": "hold", "control": "open", "duration": 4.9}],
+    })  # fmt: skip
+    Path("plan.toml").write_text(plan.text)
+    rf.simulate(plan).save("plan.nc")
+    Path("drill.toml").write_text(f'mission = "plan.toml"\n[drill]\nfiles = ["{log}"]\n')
+    words = "agent 1 crosses the fence 'yard' by 1.0"
+    for judge in (
+        ["plan.toml", str(log)],
+        ["plan.nc", str(log)],
+        [str(log), "--mission", "plan.toml"],
+    ):
+        assert main(["assess", *judge, *["--noise", "0.001"][: 2 * (len(judge) < 3)]]) == 1
+        assert words in " ".join(capsys.readouterr().out.split()), judge
+    assert main(["sweep", "drill.toml", "--quiet"]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_receiver_without_a_fix_tells_no_place(tmp_path):
@@ -763,6 +794,30 @@ def test_robots_in_frames_of_their_own_are_not_compared(tmp_path):
     assert read.names == ("/tf:cf1/base", "/tf:cf2/base")
     assert said(read, "positions are in frames enu cf1/odom, enu cf2/odom")
     np.testing.assert_allclose(at_samples(read, 1)[1][:, 0], 0.1 * np.arange(50))
+
+
+def test_parts_of_a_recording_are_read_by_their_folder(log, tmp_path):
+    """Two parts alone are no vehicles of one flight, and the refusal says what is; with it they are the whole."""
+    whole, parts = log("transforms.db3"), []
+    with closing(sqlite3.connect(whole)) as base:
+        times = [t for (t,) in base.execute("SELECT timestamp FROM messages ORDER BY timestamp")]
+    for k, later in enumerate("><"):
+        parts.append(tmp_path / f"part_{k}.db3")
+        parts[k].write_bytes(whole.read_bytes())
+        with closing(sqlite3.connect(parts[k])) as base, base:
+            base.execute(
+                f"DELETE FROM messages WHERE timestamp {later}= ?", (times[len(times) // 2],)
+            )
+    with pytest.raises(TrajectoryError, match=r"by its folder with metadata\.yaml"):
+        read_trajectories(parts)
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    for part in parts:
+        part.rename(folder / part.name)
+    (folder / "metadata.yaml").touch()
+    read = read_trajectories(folder, gaps="bridge")
+    assert read.names == read_trajectories(whole, gaps="bridge").names
+    assert len(read.curves[0].time) > 2
 
 
 def test_frames_that_move_in_each_other_are_refused(tmp_path):

@@ -376,6 +376,10 @@ REFUSED = {
         "time;x;y;z\n0;1,500;1,000;2,000\n1;2,500;1,000;2,000\n",
         "Write decimals with a point",
     ),
+    "thousands and decimals": (
+        'time,x,y,z\n0,"1,000.5",1,2\n1,"1,001.5",1,2\n',
+        "no marks between thousands",
+    ),
     "both marks": ("time;x;y;z\n0;1,5;1;2.5\n1;2,5;1;2.5\n", "Write decimals with a point"),
     "units contradict": (
         "time_s,x,y,z\nms,mm,mm,mm\n0,0,0,1\n1,1,0,1\n",

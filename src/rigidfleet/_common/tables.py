@@ -213,8 +213,9 @@ class TextTable:
                     continue
                 line, name = int(self.lines[row]), self.names[which[i]]
                 why = f"{name} is {field[:40] or 'empty'}, not a finite number"
-                remedy = "Leave out rows without a position"
-                remedy = "Write decimals with a point" if _COMMA.fullmatch(field) else remedy
+                grouped = re.fullmatch(r"[-+]?[\d.,][-+\d.,' eE]*", field)
+                remedy = "Write decimals with a point, and no marks between thousands"
+                remedy = remedy if grouped else "Leave out rows without a position"
                 faults.setdefault(line, Fault(line, self.texts[line - 1].strip(), why, remedy))
         if faults:
             raise ContentError(*(faults[line] for line in sorted(faults)))

@@ -113,6 +113,7 @@ def assess(
     """
     from rigidfleet.assessment import assess as judge
     from rigidfleet.mission import as_mission
+    from rigidfleet.result import Result
 
     if not files:
         raise RigidfleetError("no file was given; give a result or trajectories to judge")
@@ -123,21 +124,21 @@ def assess(
     }  # fmt: skip
     chosen = [key for key, value in options.items() if value is not None]
     plan = _is_plan(files[0])
-    alone = plan and len(files) == 1
-    if alone and files[0].suffix != ".nc":
+    planned: Result | str | None = str(files[0]) if plan else None
+    if plan and files[0].suffix == ".nc":
+        planned = Result.load(files[0])
+    alone = len(files) == 1
+    if alone and isinstance(planned, str):
         as_mission(str(files[0]))  # what is wrong with it comes first
         raise RigidfleetError(
             f"{files[0]}: is a mission, and no flight. Fly and judge it by `rigidfleet run {files[0]}`, or give logs of"
             " its flight behind it"
         )
-    if alone:
-        from rigidfleet.result import Result
-
+    if alone and isinstance(planned, Result):
         if chosen:
             words = f"--{chosen[0].replace('_', '-')}: no effect on a result, which has its own mission; remove it"
             raise RigidfleetError(words)
-        result = Result.load(files[0])
-        verdict = judge(result)
+        result, verdict = planned, judge(planned)
     else:
         from rigidfleet.foreign.files import read_trajectories
 
@@ -153,10 +154,9 @@ def assess(
                 "--clock: needs a plan to compare clocks with; give a mission before the logs"
             )
         higher = {} if separation_altitude is None else {"separation_altitude": separation_altitude}
-        place = mission if mission is not None else files[0] if plan else None
-        if origin is None and place is not None and Path(place).suffix != ".nc":
-            place = as_mission(str(place)).geodetic_origin
-            options["origin"] = place and (place.latitude_deg, place.longitude_deg, place.altitude)
+        known = planned.mission if isinstance(planned, Result) else planned or mission
+        if origin is None and known is not None:
+            options["origin"] = getattr(as_mission(known).geodetic_origin, "geodetic", None)
         read = read_trajectories(
             files[plan:], **{key: x for key, x in options.items() if key in _READ and x is not None}
         )
@@ -167,7 +167,7 @@ def assess(
             "radius": radius or 0.0, "ground": ground, "name": flight_name(files[0]),
         }  # fmt: skip
         doubts = _stated_doubts(noise, clock) if noise or plan else None
-        result, verdict = _judge(read, files[0] if plan else None, doubts, judged)
+        result, verdict = _judge(read, planned, doubts, judged)
     made = Files(out, result.mission.name) if out is not None else None
     if made is not None:
         made.check_writable(replace=force)
@@ -198,7 +198,7 @@ def _is_plan(file: Path) -> bool:
 
 
 def _judge(
-    read: Trajectories, plan: Path | None, doubts: Doubts | None, judged: dict[str, Any]
+    read: Trajectories, plan: Result | str | None, doubts: Doubts | None, judged: dict[str, Any]
 ) -> tuple[Result, Verdict]:
     """Trajectories that were read as a flight, and the verdict on it; with doubt, if something may be in doubt."""
     from rigidfleet.assessment import assess as judge
@@ -214,13 +214,10 @@ def _judge(
                 "the trajectory looks measured, and is taken as exact: its noise is judged, too. Say --noise"
             )
         return result, verdict
-    from rigidfleet.result import Result
     from rigidfleet.simulation.as_logged import judge_log
     from rigidfleet.simulation.flight import simulate
 
-    planned = None
-    if plan is not None:
-        planned = Result.load(plan) if plan.suffix == ".nc" else simulate(str(plan))
+    planned = simulate(plan) if isinstance(plan, str) else plan
     return judge_log(read, planned, doubts, **judged)
 
 
@@ -259,13 +256,12 @@ def _parse_limits(limits: list[str]) -> dict[str, float]:
     by_key: dict[str, float] = {}
     for option in limits:
         for part in option.split(","):
-            key, equals, value = part.partition("=")
             try:
+                key, value = part.split("=")
                 by_key[key.strip()] = float(value)
             except ValueError:
-                equals = ""
-            if not equals:
-                raise RigidfleetError(f"--limits {part}: give KEY=VALUE, such as speed=3")
+                words = f"--limits {part}: give KEY=VALUE, such as speed=3"
+                raise RigidfleetError(words) from None
     return by_key
 
 

@@ -338,6 +338,8 @@ def _rows_of_vehicles(
             why = f"the time {time[k]:.9g} s has two places: whose?"
             raise fault(why, "Name vehicles in a column agent", int(table.lines[k]))
         groups["/".join(coded[k][1][coded[k][0][rows[0]]] for k in chosen) or stem] = rows
+    if all(map(str.isdecimal, groups)):  # whoever has the first row
+        groups = dict(sorted(groups.items(), key=lambda each: int(each[0])))
     return groups, chosen
 
 

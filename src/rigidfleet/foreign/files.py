@@ -402,8 +402,9 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
         shares = steps / (np.median(steps) * (1.0 + _ROUNDING))
         if spans == "refuse" and max(first - begin, end - last) * shares[0] > steps[0]:
             why = f"{name!r} has samples from {first:g} to {last:g} s, and others from {begin:g} to {end:g} s"
-            remedy = "Give all vehicles the same span of time, or say what it does before and after: `assess --spans "
-            raise _error(source, why, f"{remedy}stand` or `--spans away`")
+            remedy = "Give all vehicles the same span of time (a recording in parts by its folder with metadata.yaml)"
+            words = "or say what it does before and after: `assess --spans stand` or `--spans away`"
+            raise _error(source, why, f"{remedy}, {words}")
         k = int(shares.argmax())
         if gaps == "refuse" and shares[k] > _LONGEST:
             why = f"{name!r} has no sample between {curve.time[k]:g} and {curve.time[k + 1]:g} s, {shares[k]:.0f} times"

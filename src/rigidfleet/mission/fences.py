@@ -62,12 +62,12 @@ class Area(Part):
         """
         if self.coordinates is None:
             return [[np.array(ring) for ring in (self.polygon or (), *self.holes)]]
-        place = origin.latitude_deg, origin.longitude_deg, origin.altitude
 
         def ring_in_metres(ring: Any) -> Floats:
             longitude, latitude = np.array(ring).T
+            longitude = np.where(longitude == -180.0, 180.0, longitude)  # one meridian
             level = np.full(len(ring), origin.altitude)
-            return enu_of(np.column_stack([latitude, longitude, level]), place)[:, :2]
+            return enu_of(np.column_stack([latitude, longitude, level]), origin.geodetic)[:, :2]
 
         return [[ring_in_metres(ring) for ring in rings] for rings in self.coordinates]
 
@@ -154,7 +154,7 @@ def polygon_flaw(polygons: Sequence[Sequence[Floats]]) -> tuple[str, str] | None
     if (np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1) < bounds.LENGTH.least).any():
         return "has two corners in a row at one place", "give each corner once"
     if edges_cross(edges):
-        return "has edges that cross", "give the corners in their order; polygons may not overlap"
+        return "has edges that cross", "give corners in order; join polygons that overlap or adjoin"
 
     if any(_mean_width(ring) < _NARROW for ring in rings):
         return "bounds no area: its corners lie on a line", "give corners around it"

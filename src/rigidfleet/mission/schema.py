@@ -790,6 +790,11 @@ class GeodeticOrigin(Part):
         "height of z = 0 above mean sea level [m]", 0.0
     )
 
+    @property
+    def geodetic(self) -> tuple[float, float, float]:
+        """Latitude, longitude [deg] and height [m]."""
+        return self.latitude_deg, self.longitude_deg, self.altitude
+
 
 class VehicleYaw(Part):
     """Yaw of each vehicle, which no force of a formation depends on."""

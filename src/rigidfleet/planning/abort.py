@@ -32,6 +32,7 @@ from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.boundaries import Boundaries, BoundaryWatch, Worst, boundary_in_words
 from rigidfleet.mission.kinds import Follow, Land
 from rigidfleet.mission.obstacles import Sphere, is_ground
+from rigidfleet.planning.avoidance import kept_distances, why_no_landing
 from rigidfleet.planning.certificate import (
     CLOSE,
     Certificate,
@@ -215,7 +216,7 @@ class Aborts:
         self.home_limits = capped_limits(
             mission, acceleration=BRAKING, jerk=JERK, speed=SPEED, vertical_speed=sinking
         )
-        self.need, widest = limits.separation or 0.0, 2.0 * float(self.radius.max())
+        self.need, widest = kept_distances(mission)[0], 2.0 * float(self.radius.max())
         # In flight both are off their ways, as far as the verdict allows, but for points that only steady air pushes.
         allowed, most, d = limits.separation_allowance, limits.tracking_error, mission.disturbances
         steady = d is None or (d.noise is None and d.gusts is None and not np.any(d.mass_error))
@@ -510,8 +511,10 @@ class Aborts:
         """Straight ways home from places (N, 3) [m] where all rest at a time [s]."""
         left, goal = self.left, r.copy()
         goal[left] = self.landing_places(r)[left]  # lost ones stay
+        reason = why_no_landing(self.mission)
         if not np.isfinite(goal).all():
             reason = "there is no ground to land on: add [[obstacles]] with kind = 'ground'"
+        if reason:
             return Home(reason=reason)
         reasons, off = [], 0.0
         # Levels are tried again with as much more between them as vehicles were off their ways.
@@ -587,9 +590,9 @@ class Aborts:
     # -- aborts -------------------------------------------------------------------------------------------
 
     def all_aborts(self) -> Iterator[Abort]:
-        """The abort of each `step` of the flight."""
+        """The abort of each `step` of the flight, on which vehicles act after its start and before its end."""
         end = self.mission_end - self.options.reaction
-        for k in range(1 + max(0, math.floor(end / self.options.step - 1e-9))):
+        for k in range(self.options.reaction == 0.0, math.ceil(end / self.options.step - 1e-9)):
             yield self.abort_at(k * self.options.step)
 
     def abort_at(self, ordered: float) -> Abort:

@@ -1,4 +1,4 @@
-"""Make what avoidance in flight reads, from a mission."""
+"""Make what avoidance in flight reads, from a mission, and say what it keeps."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from rigidfleet.mission.avoidance import (
     reaction_times,
     spare_accelerations,
 )
+from rigidfleet.planning.courses import ABOVE
 from rigidfleet.solids.records import join_solids
 
 
@@ -57,3 +58,21 @@ def avoidance_in_flight(
         filtered=settings.barrier,
         flow=settings.reference == "flow",
     )
+
+
+def kept_distances(mission: Mission) -> tuple[float, float]:
+    """Separation and clearance [m] that avoidance keeps; without it, the limit of separation and 0."""
+    settings, models = mission.avoidance, mission.vehicle_models
+    limit = mission.limits.separation or 0.0
+    if settings is None or models is None:
+        return limit, 0.0
+    spare = float(extra_radii(settings, models, mission.disturbances).max())
+    separation = limit if settings.separation is None else settings.separation
+    return max(limit, separation + 2.0 * spare), settings.clearance + spare
+
+
+def why_no_landing(mission: Mission) -> str:
+    """Why vehicles cannot land, as avoidance keeps them higher than landings end; "" if it lets them."""
+    _, keeps = kept_distances(mission)
+    words = f"[avoidance] keeps vehicles {keeps:.2g} m from the ground, and a landing ends {ABOVE:g} m above it"
+    return f"{words}: lower its clearance or margin" if keeps > ABOVE else ""

@@ -53,7 +53,7 @@ class AbortsCheck(Shown):
         to = "any place" if options.to == "any" else "their own places"
         parts = [
             FactTable(heads, [*self._abort_rows()], ("way home", "one that does not hear")),
-            Line(text, "ok" if ways == all_ else "note"),
+            Line(text, "ok" if 0 < ways == all_ else "note"),
         ]
         return Sheet(name, f"aborts, {options.reaction:g} s after each order, to {to}", parts)
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet.mission import Mission
+from rigidfleet.planning.avoidance import avoidance_in_flight, why_no_landing
 from rigidfleet.preflight.findings import Remark
 
 
@@ -19,12 +20,13 @@ def is_left_to_avoidance(mission: Mission, topic: str, limit: float = 0.0) -> bo
 
 
 def braking_remarks(mission: Mission) -> Iterator[Remark]:
-    """Remark on the two vehicles, or the vehicle and the obstacle at rest, that braking at the start leaves nearest."""
+    """Remark on landings, and on the two, vehicles or an obstacle at rest, that braking at the start leaves nearest."""
+    if any(phase.lands for phase in mission.phases) and (words := why_no_landing(mission)):
+        yield Remark("fails", "avoidance", words)
     if mission.avoidance is None or not mission.avoidance.guard:
         return
     from rigidfleet.kernel.moving import way_to_rest
     from rigidfleet.kernel.segments import segment_distance, segment_obstacle_distance
-    from rigidfleet.planning.avoidance import avoidance_in_flight
     from rigidfleet.planning.vehicles import sampled_flight
 
     a = avoidance_in_flight(mission, sampled_flight(mission))

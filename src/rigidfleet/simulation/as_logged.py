@@ -119,6 +119,8 @@ def _likely_flight(
     estimate = _noise_of_logs(logs, doubts)
     noise = estimate.noise or PositionNoise(math.nan)
     planned = None if plan is None else _planned_ways(plan)
+    lost_at = np.full(len(logs), np.inf) if plan is None else plan.mission.lost_at
+    every_log, logs = logs, _until_losses(logs, lost_at)
     alignment, smoothed, late = None, _smooth_ways(logs, noise), np.zeros(1)
     if planned is not None:
         plans = planned.pieces[:, :, :3].swapaxes(0, 1)
@@ -127,7 +129,9 @@ def _likely_flight(
         alignment = fit_alignment(places, [Piecewise(planned.time, x) for x in plans], doubts.clock)
         offsets, late = _clock_offsets(alignment, doubts.clock)
         every = np.broadcast_to(offsets, len(logs))
-        logs = [log._replace(time=log.time - by) for log, by in zip(logs, every, strict=True)]
+        both = zip(every_log, every, strict=True)
+        every_log = [log._replace(time=log.time - by) for log, by in both]
+        logs = _until_losses(every_log, lost_at)
         if offsets.any():
             smoothed = _smooth_ways(logs, noise)
     # Beside a plan, a sample counts a step beyond it, as others are lost, and by part of which clocks may be off.
@@ -140,8 +144,13 @@ def _likely_flight(
     whole = stack_ways([own.way.between(*end) for own, end in each])
     if not read.away:
         ends[:] = whole.time[[0, -1]]
-    if plan is not None:
-        ends[:, 1] = np.minimum(ends[:, 1], plan.mission.lost_at)
+    ends[:, 1] = np.minimum(ends[:, 1], lost_at)
+    for i in [i for i, log in enumerate(every_log) if log.time[-1] > lost_at[i]]:
+        begin = np.nextafter(lost_at[[i]], np.inf)  # at the loss itself, it still flies
+        whole = whole.insert_knots(begin)
+        falls = _smooth_ways([every_log[i]], noise)[0].way.refine(whole.time, stays=True)
+        after = whole.time[:-1] >= begin
+        whole.pieces[after, i] = falls.pieces[after]
     spans = ends.tolist() if np.ptp(ends, axis=0).any() else []
     if plan is None or planned is None:
         blank = Piecewise(whole.time, np.full((*whole.pieces.shape[:2], 1, 1), np.nan))
@@ -151,7 +160,9 @@ def _likely_flight(
         flown = replace_ways(plan, planned, whole, spans)
     del whole, planned  # large
     zero = flown.statistics.get("clock", 0.0)
-    resets = [t for log, x in zip(logs, read.measured, strict=False) for t in log.time[x.resets]]
+    resets = [
+        t for log, x in zip(every_log, read.measured, strict=False) for t in log.time[x.resets]
+    ]
     flown.statistics |= {
         "names": list(read.names), "notes": list(read.notes), "read": list(read.read),
         "touch": _TOUCH * np.nan_to_num(noise.sigma), "resets": [round(t - zero, 6) for t in sorted(resets)],
@@ -181,6 +192,13 @@ def _noise_of_logs(logs: Sequence[Positions], doubts: Doubts) -> NoiseEstimate:
         return smoothing.fit_noise(logs, size, _STEP)
     words = f"that is more than the {1e3 * size:.3g} mm stated"
     return shown._replace(words=words)
+
+
+def _until_losses(logs: Sequence[Positions], lost_at: Floats) -> list[Positions]:
+    """The samples of vehicles until they are lost (N,) [s]: their fall tells nothing of the way before."""
+    ends = [max(end, log.time[_SAMPLES - 1]) for log, end in zip(logs, lost_at, strict=True)]
+    both = zip(logs, ends, strict=True)
+    return [Positions(*(x[log.time <= end] for x in log)) for log, end in both]
 
 
 def _smooth_ways(logs: Sequence[Positions], noise: PositionNoise) -> list[Smoothed]:

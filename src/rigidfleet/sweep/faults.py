@@ -205,6 +205,7 @@ class Show:
 
         self.mission, self.drill, self.n = mission, drill, mission.n_agents
         self.names: tuple[str, ...] = ()
+        self._origin = getattr(mission.geodetic_origin, "geodetic", None)
         self.curve, self.how, verdict, self.names = self._fly_or_read_ways(mission, drill.files)
         if not verdict.passed:
             why = next(check.message for check in verdict.checks if not check.passed)
@@ -244,7 +245,8 @@ class Show:
         from rigidfleet.simulation.trajectories import NAMES, result_of_trajectories
 
         if files:
-            read = read_trajectories(files, spans="stand")
+            read = read_trajectories(files, spans="stand", origin=self._origin)
+            self._origin = self._origin or read.read[0].get("origin")
             if len(read.curves) != self.n:
                 raise RigidfleetError(
                     f"{files[0]}: has {len(read.curves)} vehicles, and the show {self.n}. Give a file of each."
