@@ -120,7 +120,7 @@ def _likely_flight(
     noise = estimate.noise or PositionNoise(math.nan)
     planned = None if plan is None else _planned_ways(plan)
     lost_at = np.full(len(logs), np.inf) if plan is None else plan.mission.lost_at
-    every_log, logs = logs, _until_losses(logs, lost_at)
+    full, logs = logs, _until_losses(logs, lost_at)
     alignment, smoothed, late = None, _smooth_ways(logs, noise), np.zeros(1)
     if planned is not None:
         plans = planned.pieces[:, :, :3].swapaxes(0, 1)
@@ -129,9 +129,9 @@ def _likely_flight(
         alignment = fit_alignment(places, [Piecewise(planned.time, x) for x in plans], doubts.clock)
         offsets, late = _clock_offsets(alignment, doubts.clock)
         every = np.broadcast_to(offsets, len(logs))
-        both = zip(every_log, every, strict=True)
-        every_log = [log._replace(time=log.time - by) for log, by in both]
-        logs = _until_losses(every_log, lost_at)
+        both = zip(full, every, strict=True)
+        full = [log._replace(time=log.time - by) for log, by in both]
+        logs = _until_losses(full, lost_at)
         if offsets.any():
             smoothed = _smooth_ways(logs, noise)
     # Beside a plan, a sample counts a step beyond it, as others are lost, and by part of which clocks may be off.
@@ -145,10 +145,10 @@ def _likely_flight(
     if not read.away:
         ends[:] = whole.time[[0, -1]]
     ends[:, 1] = np.minimum(ends[:, 1], lost_at)
-    for i in [i for i, log in enumerate(every_log) if log.time[-1] > lost_at[i]]:
+    for i in [i for i, log in enumerate(full) if log.time[-1] > lost_at[i]]:
         begin = np.nextafter(lost_at[[i]], np.inf)  # at the loss itself, it still flies
         whole = whole.insert_knots(begin)
-        falls = _smooth_ways([every_log[i]], noise)[0].way.refine(whole.time, stays=True)
+        falls = _smooth_ways([full[i]], noise)[0].way.refine(whole.time, stays=True)
         after = whole.time[:-1] >= begin
         whole.pieces[after, i] = falls.pieces[after]
     spans = ends.tolist() if np.ptp(ends, axis=0).any() else []
@@ -160,9 +160,7 @@ def _likely_flight(
         flown = replace_ways(plan, planned, whole, spans)
     del whole, planned  # large
     zero = flown.statistics.get("clock", 0.0)
-    resets = [
-        t for log, x in zip(every_log, read.measured, strict=False) for t in log.time[x.resets]
-    ]
+    resets = [t for log, x in zip(full, read.measured, strict=False) for t in log.time[x.resets]]
     flown.statistics |= {
         "names": list(read.names), "notes": list(read.notes), "read": list(read.read),
         "touch": _TOUCH * np.nan_to_num(noise.sigma), "resets": [round(t - zero, 6) for t in sorted(resets)],
