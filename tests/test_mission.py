@@ -104,9 +104,9 @@ def changed(*edits: tuple[str, Any], base: dict[str, Any] = PLAIN) -> dict[str, 
         if value is REMOVED:
             del table[place]
         elif isinstance(table, list) and place == len(table):
-            table.append(value)
+            table.append(copy.deepcopy(value))
         else:
-            table[place] = value
+            table[place] = copy.deepcopy(value)
     return data
 
 
