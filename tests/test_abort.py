@@ -638,9 +638,12 @@ def test_vehicles_may_land_where_they_stood(tmp_path: Path) -> None:
     assert words in str([x.text for x in rf.check(plain).remarks])
     result = rf.simulate(plain)
     start, end = result.position[0], result.position[-1]
-    nearest = np.linalg.norm(end[:, None, :2] - start[:, :2], axis=2).argmin(axis=1)
-    others = int((nearest != np.arange(12)).sum())
-    where = [f"{i + 1} where {j + 1} did" for i, j in enumerate(nearest) if i != j]
+    off = np.linalg.norm(end[:, None, :2] - start[:, :2], axis=2)
+    apart = np.linalg.norm(start[:, None] - start, axis=2) + 1e9 * np.eye(12)
+    nearest, there = off.argmin(axis=1), off < 0.5 * apart.min(axis=0)
+    where = [f"{i + 1} where {j + 1} did" for i, j in enumerate(nearest) if i != j and there[i, j]]
+    others = len(where)
+    assert others > 5
     said = f"{others} of 12 {words}: {', '.join(where[:5])} and {others - 5} more"
     assert said in str(rf.assess(result).notes)
     result.save(tmp_path / "show.nc")
@@ -654,6 +657,16 @@ def test_vehicles_may_land_where_they_stood(tmp_path: Path) -> None:
     assert verdict.passed
     assert words not in str(verdict.notes)
     assert np.abs(result.position[-1] - result.position[0])[:, :2].max() < 1e-6
+
+
+def test_a_landing_far_from_all_places_is_nobodys() -> None:
+    """Where vehicles come down beside the places that they left, none has landed where another one stood."""
+    result = rf.simulate("falling-light")
+    start, end = result.position[0, :, :2], result.position[-1, :, :2]
+    assert np.linalg.norm(end[:, None] - start, axis=2).argmin(axis=1).tolist() != [
+        *range(len(start))
+    ]
+    assert "where another one stood" not in str(rf.assess(result).notes)
 
 
 def test_a_landing_on_own_places_needs_time() -> None:

@@ -508,8 +508,12 @@ class Mission(Contents, Shown):
             return ""
         from scipy.spatial import KDTree
 
-        near = KDTree(start[:, :2]).query(end[:, :2])[1]
-        others = np.flatnonzero(stand & (near != np.arange(len(end))))
+        pads = KDTree(start[:, :2])
+        far, near = pads.query(end[:, :2])
+        there = (
+            far < 0.5 * pads.query(start[near, :2], 2)[0][:, 1]
+        )  # nearer than half the way to the next pad
+        others = np.flatnonzero(stand & there & (near != np.arange(len(end))))
         who = first_few([f"{i + 1} where {near[i] + 1} did" for i in others])
         words = f"{len(others)} of {len(end)} vehicles land where another one stood: {who}"
         return words if others.size else ""
