@@ -631,9 +631,9 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_vehicles_may_land_where_they_stood(tmp_path: Path) -> None:
     """With places = "own" each vehicle lands where it stood; without, check, verdict and export tell who does not."""
-    data = load_mission("change-of-picture").to_dict()
+    plain = load_mission("change-of-picture")
+    data = plain.to_dict()
     data["phases"][3]["yaw_deg"] = 90.0
-    plain = Mission.from_dict(data)
     words = "vehicles land where another one stood"
     assert words in str([x.text for x in rf.check(plain).remarks])
     result = rf.simulate(plain)

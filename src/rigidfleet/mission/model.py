@@ -510,9 +510,8 @@ class Mission(Contents, Shown):
 
         pads = KDTree(start[:, :2])
         far, near = pads.query(end[:, :2])
-        there = (
-            far < 0.5 * pads.query(start[near, :2], 2)[0][:, 1]
-        )  # nearer than half the way to the next pad
+        # A place reaches half the way to the next one.
+        there = far < 0.5 * pads.query(start[near, :2], 2)[0][:, 1]
         others = np.flatnonzero(stand & there & (near != np.arange(len(end))))
         who = first_few([f"{i + 1} where {near[i] + 1} did" for i in others])
         words = f"{len(others)} of {len(end)} vehicles land where another one stood: {who}"
