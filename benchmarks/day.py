@@ -79,11 +79,8 @@ def areas(folder: Path) -> Iterator[Line]:
         "disturbances": {"wind": [2.0, 1.0, 0.0]},
     }
     busy = []
-    for tables in (
-        more,
-        {"disturbances": more["disturbances"]},
-        more,
-    ):  # the first may have to compile
+    # The first may have to compile.
+    for tables in (more, {"disturbances": more["disturbances"]}, more):
         file = with_toml_suffix(folder, SHOW, **tables)
         busy.append(ran("run", file, "--no-figures", "--force", "--out", str(folder / "areas"))[2])
     yield Line(

@@ -17,6 +17,7 @@ from rigidfleet.errors import RigidfleetError
 if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
     from rigidfleet.foreign.curves import Trajectories
+    from rigidfleet.mission import Mission
     from rigidfleet.result import Result
     from rigidfleet.simulation.as_logged import Doubts
 
@@ -112,7 +113,7 @@ def assess(
         Print the verdict as JSON.
     """
     from rigidfleet.assessment import assess as judge
-    from rigidfleet.mission import as_mission
+    from rigidfleet.mission import Mission, as_mission
     from rigidfleet.result import Result
 
     if not files:
@@ -124,12 +125,11 @@ def assess(
     }  # fmt: skip
     chosen = [key for key, value in options.items() if value is not None]
     plan = _is_plan(files[0])
-    planned: Result | str | None = str(files[0]) if plan else None
-    if plan and files[0].suffix == ".nc":
-        planned = Result.load(files[0])
+    planned: Result | Mission | None = None
+    if plan:
+        planned = Result.load(files[0]) if files[0].suffix == ".nc" else as_mission(str(files[0]))
     alone = len(files) == 1
-    if alone and isinstance(planned, str):
-        as_mission(str(files[0]))  # what is wrong with it comes first
+    if alone and isinstance(planned, Mission):
         raise RigidfleetError(
             f"{files[0]}: is a mission, and no flight. Fly and judge it by `rigidfleet run {files[0]}`, or give logs of"
             " its flight behind it"
@@ -198,7 +198,7 @@ def _is_plan(file: Path) -> bool:
 
 
 def _judge(
-    read: Trajectories, plan: Result | str | None, doubts: Doubts | None, judged: dict[str, Any]
+    read: Trajectories, plan: Result | Mission | None, doubts: Doubts | None, judged: dict[str, Any]
 ) -> tuple[Result, Verdict]:
     """Trajectories that were read as a flight, and the verdict on it; with doubt, if something may be in doubt."""
     from rigidfleet.assessment import assess as judge
@@ -214,10 +214,11 @@ def _judge(
                 "the trajectory looks measured, and is taken as exact: its noise is judged, too. Say --noise"
             )
         return result, verdict
+    from rigidfleet.mission import Mission
     from rigidfleet.simulation.as_logged import judge_log
     from rigidfleet.simulation.flight import simulate
 
-    planned = simulate(plan) if isinstance(plan, str) else plan
+    planned = simulate(plan) if isinstance(plan, Mission) else plan
     return judge_log(read, planned, doubts, **judged)
 
 

@@ -216,6 +216,7 @@ class Aborts:
         self.home_limits = capped_limits(
             mission, acceleration=BRAKING, jerk=JERK, speed=SPEED, vertical_speed=sinking
         )
+        self.no_landing = why_no_landing(mission)
         self.need, widest = kept_distances(mission)[0], 2.0 * float(self.radius.max())
         # In flight both are off their ways, as far as the verdict allows, but for points that only steady air pushes.
         allowed, most, d = limits.separation_allowance, limits.tracking_error, mission.disturbances
@@ -511,7 +512,7 @@ class Aborts:
         """Straight ways home from places (N, 3) [m] where all rest at a time [s]."""
         left, goal = self.left, r.copy()
         goal[left] = self.landing_places(r)[left]  # lost ones stay
-        reason = why_no_landing(self.mission)
+        reason = self.no_landing
         if not np.isfinite(goal).all():
             reason = "there is no ground to land on: add [[obstacles]] with kind = 'ground'"
         if reason:

@@ -194,9 +194,9 @@ def _noise_of_logs(logs: Sequence[Positions], doubts: Doubts) -> NoiseEstimate:
 
 def _until_losses(logs: Sequence[Positions], lost_at: Floats) -> list[Positions]:
     """The samples of vehicles until they are lost (N,) [s]: their fall tells nothing of the way before."""
-    ends = [max(end, log.time[_SAMPLES - 1]) for log, end in zip(logs, lost_at, strict=True)]
-    both = zip(logs, ends, strict=True)
-    return [Positions(*(x[log.time <= end] for x in log)) for log, end in both]
+    both = zip(logs, lost_at, strict=True)
+    counts = [max(_SAMPLES, log.time.searchsorted(end, "right")) for log, end in both]
+    return [Positions(*(x[:count] for x in log)) for log, count in zip(logs, counts, strict=True)]
 
 
 def _smooth_ways(logs: Sequence[Positions], noise: PositionNoise) -> list[Smoothed]:
