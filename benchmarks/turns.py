@@ -73,7 +73,6 @@ def measured() -> dict[str, float]:
         mission = rf.load_mission(name)
         rows[f"simulate(), {name}"] = least(lambda m=mission: rf.simulate(m), 5)
         result = rf.simulate(mission)
-        result.compute_lazy_values()
         rows[f"assess(), {name}"] = least(lambda r=result: rf.assess(r), 9, 5)
         eight = [mission] * 8
         rows[f"eight side by side with verdicts, {name}"] = least(

@@ -278,16 +278,22 @@ class Measurements:
     def shape_errors_and_fits(self) -> tuple[dict[int, float | None], dict[int, Fit]]:
         """Greatest errors [m] of edges against the formation at the end of each phase that has one, and its fits."""
         result, mission, errors, fits = self.result, self.mission, {}, {}
+        alike: dict[tuple[str, bytes], list[tuple[int, int]]] = {}
         for index, k in zip(self.flown, self.last, strict=True):
             if (name := result.phases[index].formation) is None:
                 continue
-            r, left = result.position[[k]], np.flatnonzero(self.left[k])
             edges, intended = self.edges_at_sample(name, k)
-            errors[index] = _greatest_size(proximity.pair_distances(r, edges)[:, 0] - intended)
-            slots = mission.formation_slots(name)
-            if slots is not None and len(left) > 1 and np.isfinite(r).all():
+            off = proximity.pair_distances(result.position[[k]], edges)[:, 0] - intended
+            errors[index] = _greatest_size(off)
+            if np.isfinite(result.position[k]).all():
+                alike.setdefault((name, self.left[k].tobytes()), []).append((index, k))
+        for (name, _), phases in alike.items():  # those of one formation at once
+            left, slots = np.flatnonzero(self.left[phases[0][1]]), mission.formation_slots(name)
+            if slots is not None and len(left) > 1:
                 most = mission.formations[name].greatest_error
-                (fits[index],) = fit_samples(r[:, left], slots[left], left, most)
+                indices, last = map(list, zip(*phases, strict=True))
+                each = fit_samples(result.position[last][:, left], slots[left], left, most)
+                fits.update(zip(indices, each, strict=True))
         return errors, fits
 
     @property

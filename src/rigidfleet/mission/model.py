@@ -71,13 +71,19 @@ def _compute_once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
 
     @wraps(method)
     def wrapper(self: Mission, name: Any) -> A:
-        key = wrapper.__name__, name
-        if key not in self._computed_arrays:
-            self._computed_arrays[key] = method(self, name)
-        made = self._computed_arrays[key]
+        if (key := (wrapper.__name__, name)) not in self._made:
+            self._made[key] = method(self, name)
+        made = self._made[key]
         return made if made is None or made.dtype.kind == "i" else made.copy()
 
     return wrapper
+
+
+def part_of_mission(mission: Mission, make: Callable[..., Any], *key: Any) -> Any:
+    """What ``make`` makes of a mission and a key, made once for the mission: nobody may change it."""
+    if (make, *key) not in mission._made:
+        mission._made[make, *key] = make(mission, *key)
+    return mission._made[make, *key]
 
 
 #: Vehicles no higher above what is below them stand on it [m].
@@ -382,7 +388,7 @@ class Mission(Contents, Shown):
         return taken.attitude == "free" or not self.formations[taken.formation].knows_slots
 
     @cached_property
-    def _computed_arrays(self) -> dict[tuple[str, str], Any]:
+    def _made(self) -> dict[tuple[Any, ...], Any]:
         return {}
 
     @_compute_once

@@ -29,6 +29,7 @@ from rigidfleet.kernel.problem import (
     Disturbance,
     External,
     Feedback,
+    Graph,
     Motion,
     Problem,
     Reference,
@@ -41,6 +42,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Mission, Phase, Regulator, bounds
+from rigidfleet.mission.model import part_of_mission
 from rigidfleet.mission.schema import IntegratorOptions
 from rigidfleet.planning import solvers
 from rigidfleet.planning.body_trajectories import points_passed
@@ -230,8 +232,7 @@ def plan_phase(
         The phase has no time left, or would take hours to simulate.
     """
     phase, shaping, now, name = leg.phase, leg.phase.shaping, leg.departure.now, leg.formation
-    masses = mission.fleet.mass.copy()
-    edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
+    masses, edges = mission.fleet.mass.copy(), _edges(mission, name)
     method = solvers.choose_method(len(masses), edges, mission.constraint.solver)
     _refuse_hopeless_phase(mission, phase, leg.start, edges if method == "dense" else edges[:0])
     d1 = mission.formation_distances(name) if name else np.zeros(0)
@@ -253,11 +254,8 @@ def plan_phase(
     problem = Problem(
         body_formulation=mission.formulation == "body",
         has_frame=leg.frame is not None,
-        vehicles=Vehicles(
-            masses, 1.0 / masses, float(masses.sum()), float(masses.mean()), mission.fleet.thrust_limit.copy(),
-            mission.agents.saturate, mission.gravity,
-        ),
-        graph=graph(edges, masses, large=method != "dense"),
+        vehicles=part_of_mission(mission, _vehicles),
+        graph=part_of_mission(mission, _constraint_graph, name, method != "dense"),
         law=_constraint_law(
             mission,
             mission.damping(held, now.lost),
@@ -266,7 +264,7 @@ def plan_phase(
         reference=reference,
         motion=motion,
         feedback=feedback,
-        control=_control_of_phase(mission, phase, masses),
+        control=part_of_mission(mission, _control, phase.control, tuple(phase.input_force)),
         disturbance=no_disturbance(masses) if disturbance is None else disturbance,
         external=_limit_integrator_step(external or External(), motion, reference),
     )  # fmt: skip
@@ -335,6 +333,22 @@ def _name_if_in_formation(mission: Mission, name: str | None, now: PhaseState) -
     return name if (np.abs(lengths - wanted) <= _NEAR * wanted.min()).all() else None
 
 
+def _edges(mission: Mission, name: str | None) -> Ints:
+    """Edges (m, 2) of a formation; none without one."""
+    return mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
+
+
+def _vehicles(mission: Mission) -> Vehicles:
+    m, limit = mission.fleet.mass.copy(), mission.fleet.thrust_limit.copy()
+    return Vehicles(
+        m, 1.0 / m, float(m.sum()), float(m.mean()), limit, mission.agents.saturate, mission.gravity
+    )
+
+
+def _constraint_graph(mission: Mission, name: str | None, large: bool) -> Graph:
+    return graph(_edges(mission, name), mission.fleet.mass, large=large)
+
+
 def _agree(lengths: Floats, slots: Floats, edges: Ints) -> bool:
     """Whether the edges (m, 2) of slots have the lengths (m,) asked for, to rounding [m]."""
     own = distance_geometry.distances(slots, edges)
@@ -357,10 +371,10 @@ def _constraint_law(mission: Mission, mu: float, *, damped: bool) -> ConstraintL
     )
 
 
-def _control_of_phase(mission: Mission, phase: Phase, masses: Floats) -> Control:
-    kind = {"open": OPEN, "tracking": TRACKING, "body": BODY}[phase.control]
-    force = np.tile(np.array(phase.input_force, dtype=float), (len(masses), 1))
-    force[:, 2] += masses * mission.gravity
+def _control(mission: Mission, control: str, input_force: tuple[float, ...]) -> Control:
+    kind = {"open": OPEN, "tracking": TRACKING, "body": BODY}[control]
+    force = np.tile(np.array(input_force, dtype=float), (mission.n_agents, 1))
+    force[:, 2] += mission.fleet.mass * mission.gravity
     allocation = mission.allocation
     method = RIGID if allocation.method == "rigid" else SPLITS[allocation.torque_split]
     return Control(kind, force, *mission.tracking_gains, method)

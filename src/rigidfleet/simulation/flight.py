@@ -21,6 +21,7 @@ from rigidfleet.kernel.problem import TRACKING, External, Motion, workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
+from rigidfleet.mission.model import part_of_mission
 from rigidfleet.planning.disturbances import mission_disturbance
 from rigidfleet.planning.legs import Leg, state_at_start
 from rigidfleet.planning.losses import Answer, answer_to_loss, legs_from
@@ -185,6 +186,11 @@ def simulate(
             error.result = flight.finish(f"{error}, in phase '{flight.phases[-1].name}'")
         raise
     return flight.finish()
+
+
+def _first_leg(mission: Mission, anywhere: bool) -> Leg:
+    """The leg of a mission's first phase: made once, the shortest flights that are repeated save a quarter."""
+    return timed_leg(mission, mission.phases[0], state_at_start(mission), 0, anywhere=anywhere)
 
 
 @with_earlier_members(
@@ -385,10 +391,14 @@ class Flight:
         if self._phases_begun:
             self._report_progress(phase, planning=True)
         try:
-            where = self._state_now, len(self._phases_begun)
             # Avoidance leads the body beside its plan, from where a follow leads back; never the slots about it.
             evades = phase.follows_curves and not by_hand and layers(self.mission) is not None
-            leg = timed_leg(self.mission, phase, *where, anywhere=evades)
+            if by_hand or self._phases_begun:
+                where = self._state_now, len(self._phases_begun)
+                leg = timed_leg(self.mission, phase, *where, anywhere=evades)
+            else:
+                leg = part_of_mission(self.mission, _first_leg, evades)
+                leg = copy_with(leg, before=copy_with(leg.before))
             plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
             self._check_not_flipped(plan)
