@@ -6,6 +6,8 @@ A picture that looks as before is kept to the byte: the last digits of a simulat
 import io
 import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -42,12 +44,19 @@ def flight() -> None:
 
 def show() -> None:
     """The pictures of a show, made as its page makes it."""
-    letters = outlines.slots_on_outlines(outlines.text_outlines("HI"), 100, 2.0)
-    scenes = [show_draft.shape_scene(shape, 100, 2.0) for shape in ("sphere", "helix")]
-    scenes.append(show_draft.points_scene("logo", Points(letters, None), "logo.csv"))
-    text = show_draft.show_mission_text("my-show", scenes, agents=100, spacing=2.0)
-    result = rf.simulate(Mission.from_toml(text))
+    options = ["--agents", "100", "--spacing", "2"]
     with TemporaryDirectory() as folder:
+        for words in (
+            ["design", "text:HI", *options, "--edges", "none", "--out", "logo.csv"],
+            ["new", "my-show", "--show", *options, "--formations", "sphere,helix,logo.csv"],
+        ):
+            subprocess.run(
+                [sys.executable, "-m", "rigidfleet", *words],
+                cwd=folder,
+                check=True,
+                stdout=subprocess.DEVNULL,
+            )
+        result = rf.simulate(Path(folder, "my-show.toml"))
         paths = rf.plot(result, folder, formats=["png"], names=["formations", "operation"])
         for path, name in zip(paths, ("show", "show-operation"), strict=True):
             _save_with_few_colours(path, name)
