@@ -23,7 +23,7 @@ from scipy.stats import t as student
 import rigidfleet as rf
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.planning.preview import preview_phases
-from rigidfleet.planning.vehicles import vehicle_lags
+from rigidfleet.planning.vehicles import lags_by_vehicle
 from rigidfleet.preflight.network import check_network
 from rigidfleet.typing import Floats
 
@@ -320,7 +320,7 @@ def checks(page: Page) -> None:
         begun = process_time()
         rf.check(m)
         whole = process_time() - begun
-        way, lags, begun = preview_phases(m)[0], vehicle_lags(m), process_time()
+        way, lags, begun = preview_phases(m)[0], lags_by_vehicle(m), process_time()
         check_network(m, way, lags)
         part = process_time() - begun
         what = f"{m.name}: {m.n_agents} vehicles, {len(m.edges):,} edges"

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import impulse, lsim
 
 from rigidfleet.assessment import assess
-from rigidfleet.math.margins import Lag, LoopGains, reference_error_gain
+from rigidfleet.math.margins import Lag, LoopGains, tracking_lag_time
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import MODELS
 from rigidfleet.planning.vehicles import tracking_lag_times
@@ -177,7 +177,7 @@ def test_the_reserve_bounds_what_a_vehicle_leaves_its_reference_by(lag):
             systems.append((np.polymul(np.r_[s, 0.0], share), below))
     time = np.linspace(0.0, 20.0, 20_001)
     bounds = [np.trapezoid(np.abs(impulse(system, T=time)[1]), time) for system in systems]
-    found = reference_error_gain(lag, law, 0.0)
+    found = tracking_lag_time(lag, law, 0.0)
     assert found == pytest.approx(max(bounds), rel=0.02)
     jerk = np.repeat(np.random.default_rng(1).choice([-1.0, 1.0], 201), 100)[: len(time)]
     assert max(np.abs(lsim(system, jerk, time)[1]).max() for system in systems) < found

@@ -11,7 +11,7 @@ from rigidfleet.cli import codes, console
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission, json_schema, mission_names, mission_text
 from rigidfleet.mission import bounds as limits
-from rigidfleet.mission.bounds import toml_excess_in_words
+from rigidfleet.mission.bounds import toml_oversize_in_words
 from rigidfleet.mission.formations import coincident_pairs
 from rigidfleet.planning import filters
 from rigidfleet.preflight.check import check
@@ -128,10 +128,10 @@ def test_what_is_no_depth_is_passed_over():
     deep = "[" * 50 + ".a" * 50
     text = f'a = "{deep}" # {deep}\nb = \'{deep}\'\nc = """\n{deep}"\\"""" # """\nd = \'\'\'{deep}\'\'\'\n'
     text += "e = [" + "[1.5, 2.5]," * 50 + "]\n" + "[[f.g]]\n" * 50
-    assert toml_excess_in_words(text) == ""
-    assert "depth of brackets is 9 at line 57" in toml_excess_in_words(text + "[" * 9)
+    assert toml_oversize_in_words(text) == ""
+    assert "depth of brackets is 9 at line 57" in toml_oversize_in_words(text + "[" * 9)
     for name in mission_names():
-        assert toml_excess_in_words(mission_text(name)) == ""
+        assert toml_oversize_in_words(mission_text(name)) == ""
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_what_is_no_depth_is_passed_over():
 def test_the_text_is_looked_at_in_one_pass(text):
     """Twice the text takes about twice as long, whatever it repeats: a megabyte in seconds, not minutes."""
     begun = time.process_time()
-    toml_excess_in_words(text * (1_000_000 // len(text)))
+    toml_oversize_in_words(text * (1_000_000 // len(text)))
     assert time.process_time() - begun < 20.0
 
 
@@ -276,7 +276,7 @@ def test_a_long_check_says_what_it_does(tmp_path: Path, monkeypatch, capsys):
     assert "Checking" not in capsys.readouterr().err
     monkeypatch.setattr(console, "_PATIENCE", 0.05)
     monkeypatch.setattr(
-        "rigidfleet.preflight.check.check_gains", lambda *_: time.sleep(0.5) or 1 // 0
+        "rigidfleet.preflight.check.check_pid_gains", lambda *_: time.sleep(0.5) or 1 // 0
     )
     cli.main(["check", str(tmp_path / "a.toml")])
     assert re.search(r"Checking .*a.toml: planned paths, \d+ s", capsys.readouterr().err)
@@ -292,4 +292,4 @@ def test_the_bounds_are_those_of_the_documents():
 @pytest.mark.parametrize("deep", ["[" * 5000 + "]" * 5000, "{" + ".".join("a" * 5000) + " = 1}"])
 def test_a_string_that_ends_in_quotes_hides_nothing(quotes, deep):
     """TOML lets a string of several lines end in quotes of its own; what comes after it is looked at."""
-    assert "depth" in toml_excess_in_words(f"note = [{quotes}, {deep}]\n")
+    assert "depth" in toml_oversize_in_words(f"note = [{quotes}, {deep}]\n")

@@ -51,7 +51,7 @@ def curves(n, spread=6.0):
 
 def signed(region, points):
     """Signed distances of points (M, 3), which are curves of one control point."""
-    return region.depths_of_curves(points[:, :, None], outside=True)[0]
+    return region.curve_depths_and_bounds(points[:, :, None], outside=True)[0]
 
 
 def along(points, t):
@@ -76,12 +76,12 @@ def test_the_worst_of_a_curve_is_between_no_samples(outside):
     region, sign = Region.of_rings(RINGS, 2.0, 7.0), 1.0 if outside else -1.0
     for points in curves(30):
         dense = (sign * signed(region, along(points, np.linspace(0, 1, 20_001)))).max()
-        value, bound = (x[0] for x in region.depths_of_curves(points[None], outside=outside))
+        value, bound = (x[0] for x in region.curve_depths_and_bounds(points[None], outside=outside))
         assert value <= dense + 1e-9
         assert bound >= dense - 1e-9
 
         def measure(p, _):
-            value, bound = region.depths_of_curves(p, outside=outside)
+            value, bound = region.curve_depths_and_bounds(p, outside=outside)
             return value, np.full(len(p), 0.5), bound
 
         worst = greatest_curve_measure(points[None], measure, lambda _: 1e-3)

@@ -674,7 +674,7 @@ def test_shape_error_is_that_of_the_worst_pair():
     result = a_flight()
     slots = np.array(result.mission.formation_slots("shape"))
     grown = a_flight(position=np.broadcast_to(1.1 * slots + 7.0, result.position.shape))
-    np.testing.assert_allclose(curves.shape_error(grown), 0.4)
+    np.testing.assert_allclose(curves.greatest_pair_error(grown), 0.4)
 
 
 def test_many_samples_are_light_and_keep_their_peaks():

@@ -838,9 +838,9 @@ def test_sweeps_push_all_and_then_those_that_push_until_little_changes(ask):
         barriers,
         "difference_along",
         "push_apart",
-        "edge_softness",
-        "relax_barrier",
-        "relax_edges",
+        "edge_compliance",
+        "enforce_barrier",
+        "update_edge_pulls",
         "sweep_gauss_seidel",
     )
     x, right = np.r_[np.zeros(count), rng.normal(size=m)], np.r_[missing, np.zeros(m)]

@@ -9,10 +9,10 @@ import pytest
 from rigidfleet.kernel.compiler.simd import (
     as_lanes,
     fill_lanes,
-    one_flight_sum_or_worst,
     pack_lanes,
     rough_inverse,
-    unpack,
+    sum_lanes_or_worst,
+    unpack_lanes,
 )
 
 VALUES = np.random.default_rng(0).normal(size=(5, 8))
@@ -24,7 +24,7 @@ def test_packing_keeps_every_number():
         packed = pack_lanes(values)
         assert packed.shape == values.shape[:-1]
         assert packed.ctypes.data % 64 == 0
-        np.testing.assert_array_equal(unpack(packed), values)
+        np.testing.assert_array_equal(unpack_lanes(packed), values)
 
 
 def test_arithmetic_acts_on_each_lane():
@@ -43,7 +43,7 @@ def test_arithmetic_acts_on_each_lane():
     out = pack_lanes(np.zeros_like(a))
     formula(pack_lanes(a), pack_lanes(b[None]), out)
     expected = 0.5 * (2 * a - b + a * b + np.maximum(a, 0.25) * np.maximum(b, a) - abs(a))
-    np.testing.assert_allclose(unpack(out), expected, rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(unpack_lanes(out), expected, rtol=1e-14, atol=1e-14)
 
 
 def test_a_number_becomes_a_vector_where_it_meets_one():
@@ -58,7 +58,7 @@ def test_a_number_becomes_a_vector_where_it_meets_one():
 
     out = pack_lanes(np.zeros((2, 8)))
     total(pack_lanes(VALUES), out)
-    np.testing.assert_allclose(unpack(out), [VALUES.sum(axis=0), np.ones(8)], atol=1e-15)
+    np.testing.assert_allclose(unpack_lanes(out), [VALUES.sum(axis=0), np.ones(8)], atol=1e-15)
 
 
 def test_blocks_are_a_view_of_eight_states_each():
@@ -77,7 +77,7 @@ def test_blocks_are_a_view_of_eight_states_each():
     np.testing.assert_array_equal(plain[1], 2 * plain[0])
     lanes = pack_lanes(np.stack([VALUES, VALUES]))
     assert double(lanes) == 5
-    np.testing.assert_array_equal(unpack(lanes)[1], 2 * VALUES)
+    np.testing.assert_array_equal(unpack_lanes(lanes)[1], 2 * VALUES)
 
 
 def test_an_error_is_a_sum_of_one_flight_and_the_worst_of_eight():
@@ -89,7 +89,7 @@ def test_an_error_is_a_sum_of_one_flight_and_the_worst_of_eight():
         squares = fill_lanes(0.0)
         for k in range(y.shape[0]):
             squares += y[k] * y[k]
-        return one_flight_sum_or_worst(squares, x)
+        return sum_lanes_or_worst(squares, x)
 
     assert error(VALUES.ravel()) == pytest.approx((VALUES**2).sum(), rel=1e-14)
     assert error(pack_lanes(VALUES)) == pytest.approx((VALUES**2).sum(axis=0).max(), rel=1e-14)

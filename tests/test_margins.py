@@ -21,9 +21,9 @@ from rigidfleet.math.margins import (
 )
 from rigidfleet.physics import constraint_force
 from rigidfleet.planning.preview import preview_phases
-from rigidfleet.planning.vehicles import vehicle_lags
+from rigidfleet.planning.vehicles import lags_by_vehicle
 from rigidfleet.preflight.check import check
-from rigidfleet.preflight.margins import formation_closed_loops
+from rigidfleet.preflight.margins import loops_and_omission
 
 TRIANGLE = 4 / math.sqrt(3) * np.array(
     [[math.cos(t), math.sin(t), 0.0] for t in np.deg2rad([90, 210, 330])]
@@ -144,7 +144,7 @@ def test_margins_are_those_of_python_control(lag, delay, constrained):
 def test_a_heading_is_no_other_shape():
     """A cube that turns about the vertical for a quarter has the loops of one cube, not of each heading."""
     m = rf.load_mission("cube-by-neighbours")
-    laws, _ = formation_closed_loops(m, preview_phases(m)[0], vehicle_lags(m))
+    laws, _ = loops_and_omission(m, preview_phases(m)[0], lags_by_vehicle(m))
     assert [law.where for law in laws].count("'cube'") == 1
 
 
@@ -316,7 +316,7 @@ def test_an_attitude_that_is_unstable_by_itself():
 
 
 def told(mission, lag):
-    with patch("rigidfleet.preflight.check.vehicle_lags", lambda _: [lag] * mission.n_agents):
+    with patch("rigidfleet.preflight.check.lags_by_vehicle", lambda _: [lag] * mission.n_agents):
         found = check(mission, search=False)
     return found, [r for r in found.remarks if r.topic == "margins"]
 

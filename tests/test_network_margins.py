@@ -15,14 +15,14 @@ from rigidfleet.kernel.mail import LOST, SENT
 from rigidfleet.math import pid
 from rigidfleet.math.margins import GROWTH
 from rigidfleet.planning.preview import preview_phases
-from rigidfleet.planning.vehicles import vehicle_lags
+from rigidfleet.planning.vehicles import lags_by_vehicle
 from rigidfleet.preflight.linear_flight import LinearFlight
 from rigidfleet.preflight.network import (
     greatest_stable_loss,
     growth_at_delay,
     last_stable_delay,
     linear_flights,
-    mean_square_growth,
+    rms_growth,
 )
 from rigidfleet.typing import Bools, Floats
 
@@ -42,7 +42,7 @@ def still(
 
 def linear_flight(m: rf.Mission) -> LinearFlight:
     """The linear flight of its formation."""
-    ((_, flight, _),) = linear_flights(m, preview_phases(m)[0], vehicle_lags(m))
+    ((_, flight, _),) = linear_flights(m, preview_phases(m)[0], lags_by_vehicle(m))
     return flight
 
 
@@ -281,7 +281,7 @@ def test_the_second_moment_moves_by_its_map(loss):
     linear = linear_flight(still({"delay": 0.04}, CUBE[:2], [[1, 2]]))
     expected = exact_growth(linear, linear.radio.delay, loss, 500)
     assert (expected > 0.0) == (loss == 0.95)
-    (growth,) = mean_square_growth(linear, np.array([loss]), states=64)
+    (growth,) = rms_growth(linear, np.array([loss]), states=64)
     assert growth == pytest.approx(expected, abs=0.03)
 
 
@@ -313,7 +313,7 @@ def growths(r: Floats, edges: list[list[int]], loss: float, flights: int) -> tup
     """Growth [1/s] of the root mean square over flights of the product, and as it is predicted."""
     m = still({"delay": 0.04, "loss": loss}, r, edges)
     flown = growth_flown(squares_flown(m, flights, 8.0).mean(axis=0), 8.0)
-    predicted = mean_square_growth(linear_flight(m), np.array([loss]), states=64, time=8.0)
+    predicted = rms_growth(linear_flight(m), np.array([loss]), states=64, time=8.0)
     return float(flown), float(predicted[0])
 
 

@@ -36,7 +36,7 @@ def test_values_and_derivatives_are_those_of_scipy():
         np.testing.assert_allclose(states[order], known(t, order), rtol=1e-9, atol=1e-9)
         taylor = curve.taylor_coefficients(t, 8)[order]
         np.testing.assert_allclose(taylor, known(t, order) / factorial(order), rtol=1e-9, atol=1e-9)
-    begin, end = curve.states_at_ends(3)
+    begin, end = curve.piece_end_states(3)
     for order in range(3):
         np.testing.assert_allclose(begin[order], known(TIME[:-1], order), atol=1e-12)
         left = known(np.nextafter(TIME[1:], 0.0), order)
@@ -69,7 +69,7 @@ def test_hermite_meets_all_derivatives(orders):
     t = np.linspace(*TIME[:2], 7)
     np.testing.assert_allclose(curve.at(t), krogh(t), rtol=1e-8, atol=1e-8)
     apart = Piecewise.of_ends(TIME, states[:, :-1] + 1.0, states[:, 1:])
-    np.testing.assert_allclose(apart.states_at_ends(orders)[0], states[:, :-1] + 1.0, atol=1e-9)
+    np.testing.assert_allclose(apart.piece_end_states(orders)[0], states[:, :-1] + 1.0, atol=1e-9)
     np.testing.assert_allclose(apart.jumps(orders), 1.0, rtol=1e-7)
 
 
@@ -107,7 +107,7 @@ def test_cuts_parts_and_later_ones_are_the_same_curve():
     np.testing.assert_array_equal(cut.time, np.union1d(TIME, [5.0]))
     part = curve.between(TIME[2] - 0.1, TIME[5])
     np.testing.assert_array_equal(part.time, [TIME[2] - 0.1, *TIME[2:6]])
-    for other in (cut, part, curve.refine(np.union1d(TIME, [1.0, 20.0]))):
+    for other in (cut, part, curve.with_knots(np.union1d(TIME, [1.0, 20.0]))):
         t = np.linspace(other.time[0], other.time[-1], 60)[:-1]  # at its end the next one begins
         np.testing.assert_allclose(other.at(t), curve.at(t), rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(curve.shift_time(2.0).at(INSIDE + 2.0), curve.at(INSIDE), atol=1e-10)

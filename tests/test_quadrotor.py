@@ -448,7 +448,7 @@ def test_allocation_keeps_its_priorities():
         PAPER, rotors=[[0.2, 0.15, 0], [0.15, -0.2, 0], [-0.2, -0.15, 0], [-0.15, 0.25, 0]]
     )
     for vehicle in (PAPER, uneven):
-        B = vehicle.allocation_matrix(G)
+        B = vehicle.wrench_to_rotors(G)
         for _ in range(100):
             thrust, tau = (
                 rng.uniform(-5, 30),

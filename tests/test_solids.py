@@ -183,7 +183,7 @@ def test_the_kernel_compiles_the_same_distances():
         alone = records.one_solid(form, [1.0, 3.0], [[0, 0, 0], [1, 2, 3]])
         expected = proximity.distances(*where, alone, 2.0)
         own = np.array([obstacles.point_in_solid_axes(*x, 2.0, b, s) for x in where.T])
-        found = [obstacles.solid_tangent_plane(*x, b, -1, s)[0] for x in own]
+        found = [obstacles.solid_gap_and_normal(*x, b, -1, s)[0] for x in own]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 

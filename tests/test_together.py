@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rigidfleet.assessment import assess
-from rigidfleet.kernel.compiler.simd import empty_lanes, pack_lanes, unpack
+from rigidfleet.kernel.compiler.simd import empty_lanes, pack_lanes, unpack_lanes
 from rigidfleet.kernel.engine import batch, codegen, lane_steps, native
 from rigidfleet.kernel.engine.tracer import Code, FlightTrace, UnfitError, varying_numbers
 from rigidfleet.kernel.gauge import write_watched_forces
@@ -242,9 +242,11 @@ def test_the_code_of_eight_problems_is_the_kernel(name: str, phase: int):
         for lane, p in enumerate(problems):
             expected, forces = kernel(p, y[lane], t)
             np.testing.assert_allclose(
-                unpack(dy)[3 * n :, lane], expected[3 * n :], rtol=1e-9, atol=1e-9
+                unpack_lanes(dy)[3 * n :, lane], expected[3 * n :], rtol=1e-9, atol=1e-9
             )
-            np.testing.assert_allclose(unpack(ready.gauge)[:, lane], forces, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(
+                unpack_lanes(ready.gauge)[:, lane], forces, rtol=1e-9, atol=1e-9
+            )
 
 
 def test_problems_that_branch_differently_share_no_code():
@@ -266,7 +268,7 @@ def test_arrays_of_eight_flights_become_lanes():
     parts = [np.arange(6.0).reshape(2, 3) + 10 * k for k in range(8)]
     made = codegen.packed(parts)
     for k, part in enumerate(parts):
-        np.testing.assert_array_equal(unpack(made)[..., k], part)
+        np.testing.assert_array_equal(unpack_lanes(made)[..., k], part)
     assert empty_lanes((3, 2)).ctypes.data % 64 == 0
 
 

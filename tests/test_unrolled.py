@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 
-from rigidfleet.kernel.compiler.simd import pack_lanes, unpack
+from rigidfleet.kernel.compiler.simd import pack_lanes, unpack_lanes
 from rigidfleet.kernel.engine import codegen, lane_steps, native
 from rigidfleet.kernel.engine.tracer import (
     Code,
@@ -85,7 +85,7 @@ def in_lanes(p: Problem, y: np.ndarray, t: float) -> np.ndarray:
     before = pack_lanes(np.repeat(p.reference.d0[:, None], 8, axis=1))
     dy = pack_lanes(np.zeros_like(y.T))
     call(ready._replace(before=before), pack_lanes(y.T), dy, t)
-    found, coordinates = unpack(dy).T, 3 * len(p.vehicles.m)
+    found, coordinates = unpack_lanes(dy).T, 3 * len(p.vehicles.m)
     assert not found[:, :coordinates].any()
     found[:, :coordinates] = y[:, coordinates : 2 * coordinates]
     return found

@@ -40,7 +40,7 @@ class Setpoints(NamedTuple):
     yaw_rate: Floats
 
 
-def states_of_motion(
+def states_with_jerk(
     position: Floats, velocity: Floats, acceleration: Floats, time: Floats
 ) -> Floats:
     """States (K, 4, N, 3) of a flown motion (K, N, 3) at times (K,) [s], with the jerk of quintics between them.
@@ -102,7 +102,7 @@ def setpoints_at(samples: Setpoints, wanted: Floats) -> Setpoints:
 
 def ways_of(samples: Setpoints, agents: slice) -> Piecewise:
     """The ways of n agents: pieces (k, n, 4, 8) of x, y, z [m] and yaw [rad], of degree 7 (yaw: 3)."""
-    first, knots = interval_starts(samples.time)
+    first, knots = interval_starts_and_knots(samples.time)
     state = samples.state[:, :, agents].swapaxes(0, 1)
     yaw = np.stack([samples.yaw[:, agents], samples.yaw_rate[:, agents]])[..., None]
     position, turned = (
@@ -111,7 +111,7 @@ def ways_of(samples: Setpoints, agents: slice) -> Piecewise:
     return position.stack(turned)
 
 
-def interval_starts(time: Floats) -> tuple[Ints, Floats]:
+def interval_starts_and_knots(time: Floats) -> tuple[Ints, Floats]:
     """Samples (k,) that begin an interval, which the next one ends, and the knots (k + 1,) [s] between intervals.
 
     Two samples that are one representable number apart, as at a switch of phases, are one knot with two states.

@@ -93,7 +93,7 @@ class TextTable:
     ) -> None:
         self.texts, self.words = _lines(data), words or {}
         self.line, start, self.names, below, self.separator, width = _find_header(self.texts)
-        rows = _read_text_columns(self.texts, start, width, self.separator, self.line)
+        rows = _read_columns_as_text(self.texts, start, width, self.separator, self.line)
         self.lines, self.columns, self._faults = rows
         self.named, self.decimal = bool(self.names), ""
         if not self.named and width:
@@ -150,7 +150,7 @@ class TextTable:
         columns = [self.places.get((kind, who), -1) for kind in kinds]
         return [] if -1 in columns else columns
 
-    def position_columns(self, axes: str = "", who: str = "") -> tuple[list[int], str]:
+    def position_columns_and_axes(self, axes: str = "", who: str = "") -> tuple[list[int], str]:
         """Columns of a position, x, y and z or named by directions, and where they point: ``axes``, or ``"enu"``.
 
         Raises
@@ -351,7 +351,7 @@ def _count_rows_and_width(lines: list[str], width: int, separator: str) -> tuple
     return len(fine), Counter(fine).most_common(1)[0][0] if fine else 0
 
 
-def _read_text_columns(
+def _read_columns_as_text(
     texts: list[str], start: int, width: int, separator: str, names: int
 ) -> tuple[Ints, list[np.ndarray], list[Fault]]:
     """Lines of the rows, texts of the columns, and faults; read in blocks, as rows of texts take much memory."""

@@ -81,7 +81,7 @@ def fit_alignment(logs: Logs, plan: Plan, clock: str) -> Alignment:
         logs = [(t - by, x) for (t, x), by in zip(logs, apart, strict=True)]
     start[0] = _best_clock_offset(logs, plan) if clock == "offset" else 0.0
     every = np.ones(6, dtype=np.bool_)
-    whole, errors, left = _fit(logs, plan, start, every, _misfit_and_setup(logs, plan, start[0])[1])
+    whole, errors, left = _fit(logs, plan, start, every, _mse_and_setup(logs, plan, start[0])[1])
     own = np.empty((2, len(logs)))
     for i, (log, way) in enumerate(zip(logs, plan, strict=True)):
         alone, error, _ = _fit([log], [way], whole, every)
@@ -93,7 +93,7 @@ def fit_alignment(logs: Logs, plan: Plan, clock: str) -> Alignment:
     return Alignment(fit, own, _fit(logs, plan, start, ~every)[2], left)
 
 
-def _residuals_jacobian_times(logs: Logs, plan: Plan, q: Floats) -> tuple[Floats, Floats, Floats]:
+def _residual_slopes_and_times(logs: Logs, plan: Plan, q: Floats) -> tuple[Floats, Floats, Floats]:
     """Off (M, 3), its derivatives (M, 3, 6) by the parameters q, and times (M,) of the plan."""
     rows = []
     c, s = np.cos(q[1]), np.sin(q[1])
@@ -119,7 +119,7 @@ def _fit(
     """
     q, free, errors = (start if guess is None else guess).copy(), free.copy(), np.full(6, np.nan)
     for _ in range(_TURNS):
-        off, slope, time = _residuals_jacobian_times(logs, plan, q)
+        off, slope, time = _residual_slopes_and_times(logs, plan, q)
         if not (len(off) and free.any()):
             break
         for j in np.flatnonzero(free[:3]):  # what the others do not explain of it
@@ -167,17 +167,17 @@ def _best_clock_offset(logs: Logs, plan: Plan) -> float:
     least = 0.5 * min(end - begin, span[1] - span[0])
     best = np.inf, 0.0
     for offset in np.arange(begin - span[1] + least, end - span[0] - least + _STEP, _STEP).tolist():
-        best = min(best, (_misfit_and_setup(few, plan, offset)[0], offset), key=lambda x: x[0])
+        best = min(best, (_mse_and_setup(few, plan, offset)[0], offset), key=lambda x: x[0])
     return best[1]
 
 
-def _misfit_and_setup(logs: Logs, plan: Plan, offset: float) -> tuple[float, Floats]:
+def _mse_and_setup(logs: Logs, plan: Plan, offset: float) -> tuple[float, Floats]:
     """The set-up that agrees best at an offset: the mean square that is left [m^2], infinite if too little is, and all.
 
     A turn of any angle with a scale is linear in what it makes of x and y; heights have a scale of their own here.
     """
     q = np.array([offset, *np.zeros(5)])
-    off, slope, _ = _residuals_jacobian_times(logs, plan, q)
+    off, slope, _ = _residual_slopes_and_times(logs, plan, q)
     if len(off) <= 5:
         return np.inf, q
     level = slope[..., 2:3] * np.array([[1.0], [1.0], [0.0]])

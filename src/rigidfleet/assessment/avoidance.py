@@ -16,12 +16,12 @@ from rigidfleet.result import Result
 _SLOWED = 0.99
 
 
-def guard_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def guarantee_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Whether stop segments have kept their distances at every tick, if the mission has a guard."""
     avoidance = measured.mission.avoidance
     if avoidance is None or not avoidance.guard:
         return
-    if lost := _least_guard_margins(measured, "_lost"):
+    if lost := _least_guarantee_margins(measured, "_lost"):
         e = min(lost, key=lambda e: e.when)
         words = (
             f"the guarantee of [avoidance] is lost at {e.when:.2f} s, by {e.who}: braking at once would leave them"
@@ -30,7 +30,7 @@ def guard_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
         yield limit_check(q, e, 0.0, words, passed=False)
         return
     state = "held" if _why_guarantee_is_unproved(measured) else "proved"
-    e = min(_least_guard_margins(measured), key=lambda e: e.value, default=None)
+    e = min(_least_guarantee_margins(measured), key=lambda e: e.value, default=None)
     spare = "no vehicle has come near anything"
     if e is not None:
         spare = f"{value(e.value, 'm')} to spare at least"
@@ -45,12 +45,12 @@ def avoidance_notes(measured: Measurements) -> Iterator[str]:
         return
     if not avoidance.guard:
         yield "[avoidance] without its guard guarantees nothing"
-    elif not _least_guard_margins(measured, "_lost"):
+    elif not _least_guarantee_margins(measured, "_lost"):
         words = "is proved: at every tick, all vehicles could brake in time"
         if doubt := _why_guarantee_is_unproved(measured):
             words = f"was held at every tick, but is not proved: {doubt}"
         yield f"the guarantee of [avoidance] {words}"
-    yield from _layer_share_notes(measured.result)
+    yield from _avoidance_time_notes(measured.result)
 
 
 def clock_notes(result: Result) -> Iterator[str]:
@@ -71,7 +71,7 @@ def clock_notes(result: Result) -> Iterator[str]:
         )
 
 
-def _layer_share_notes(result: Result) -> Iterator[str]:
+def _avoidance_time_notes(result: Result) -> Iterator[str]:
     """The share of time by layer, and how far the body was beside its path."""
     rate, way, acts = result.clock_rate, result.body_displacement, result.avoidance_layers
     if rate is None or way is None or acts is None or len(result.time) < 2:
@@ -91,7 +91,7 @@ def _layer_share_notes(result: Result) -> Iterator[str]:
         yield f"of the samples, by time: {', '.join(parts)}{aside}"
 
 
-def _least_guard_margins(measured: Measurements, ending: str = "") -> list[Extreme]:
+def _least_guarantee_margins(measured: Measurements, ending: str = "") -> list[Extreme]:
     """The least margins of each phase, between vehicles and to obstacles, or the first negative ones ("_lost")."""
     return [
         measured.extreme_of(name + ending, p.extremes[name + ending], p.name)

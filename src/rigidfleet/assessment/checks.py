@@ -12,7 +12,7 @@ import numpy as np
 from rigidfleet._common.quantities import MOTIONS, PLACES, QUANTITIES, Quantity, quantity
 from rigidfleet._common.text import agent_names, percent_text
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
-from rigidfleet.assessment.avoidance import guard_checks
+from rigidfleet.assessment.avoidance import guarantee_checks
 from rigidfleet.assessment.fits import is_rigid
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import (
@@ -41,7 +41,7 @@ def all_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[C
     """All checks of a flight: whether it is complete and its record true, its ends of phases, its quantities."""
     yield _completeness_check(measured.result)
     yield from _record_consistency_check(measured)
-    yield from _missing_sample_checks(measured)
+    yield from _no_sample_near_checks(measured)
     yield from _failures_or_nearest(
         [
             *_settling_checks(phases),
@@ -101,7 +101,7 @@ def _completeness_check(result: Result) -> CheckResult:
 
 def _record_consistency_check(measured: Measurements) -> Iterator[CheckResult]:
     """Fail a record that contradicts itself: it has been altered and proves nothing."""
-    contradictions = list(measured.self_contradictions())
+    contradictions = list(measured.contradictions_and_times())
     if contradictions:
         words, when = contradictions[0]
         more = f", and {len(contradictions) - 1} more like that" if len(contradictions) > 1 else ""
@@ -109,7 +109,7 @@ def _record_consistency_check(measured: Measurements) -> Iterator[CheckResult]:
         yield CheckResult("record", False, words, when=when)
 
 
-def _missing_sample_checks(measured: Measurements) -> Iterator[CheckResult]:
+def _no_sample_near_checks(measured: Measurements) -> Iterator[CheckResult]:
     """Fail waypoints and ends of shaping phases that no sample is near: they cannot be judged."""
     from rigidfleet.mission import KINDS  # takes long to load, and the flight has loaded it
 
@@ -513,5 +513,5 @@ _CHECKS: dict[str, Callable[[Measurements, Quantity], Iterator[CheckResult]]] = 
     "saturation": _saturation_check,
     "tilt": _tilt_check,
     "tracking_error": _tracking_check,
-    "guarantee": guard_checks,
+    "guarantee": guarantee_checks,
 }

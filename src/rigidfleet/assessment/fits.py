@@ -58,7 +58,7 @@ class Fit(NamedTuple):
     in_order: bool | None
 
 
-def fit_samples(
+def fits_by_sample(
     p: Floats, slots: Floats, who: Ints, greatest_error: Callable[[float], float]
 ) -> Iterator[Fit]:
     """Compare a formation as flown at G samples with its slots (N, 3): agents ``who`` (N,) at p (G, N, 3).
@@ -147,7 +147,7 @@ def is_rigid(p: Floats, edges: Ints) -> bool:
     return bool(np.isfinite(J).all()) and np.linalg.matrix_rank(J, rtol=1e-6) == 3 * len(p) - 6
 
 
-def angle_between(a: Sequence[float], b: Sequence[float]) -> float:
+def degrees_between(a: Sequence[float], b: Sequence[float]) -> float:
     """Angle [deg] between two vectors."""
     (x, y, z), (u, v, w) = a, b
     across = math.hypot(y * w - z * v, z * u - x * w, x * v - y * u)

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, Quantity, quantity
-from rigidfleet.assessment.fits import Fit, angle_between, fit_samples
+from rigidfleet.assessment.fits import Fit, degrees_between, fits_by_sample
 from rigidfleet.assessment.verdict import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -184,7 +184,7 @@ class Measurements:
         r, things = self.result.position[k, i], self.mission.obstacles
         return proximity.below(r, self.mission.fleet.radius[i], things, self.result.time[k], PAD)
 
-    def self_contradictions(self) -> Iterator[tuple[str, float]]:
+    def contradictions_and_times(self) -> Iterator[tuple[str, float]]:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
         r = result.position
@@ -292,7 +292,7 @@ class Measurements:
             if slots is not None and len(left) > 1:
                 most = mission.formations[name].greatest_error
                 indices, last = map(list, zip(*phases, strict=True))
-                each = fit_samples(result.position[last][:, left], slots[left], left, most)
+                each = fits_by_sample(result.position[last][:, left], slots[left], left, most)
                 fits.update(zip(indices, each, strict=True))
         return errors, fits
 
@@ -316,7 +316,7 @@ class Measurements:
                 fit.axis @ att.dcm_from_quaternion(q[k])
                 for q in (result.attitude_reference, result.frame)[:steers]
             )
-            angles = (angle_between(fit.turned_axis, aim.tolist()) for aim in aims)
+            angles = (degrees_between(fit.turned_axis, aim.tolist()) for aim in aims)
             flips[index] = next(filter(math.isfinite, angles), None)
         return flips
 

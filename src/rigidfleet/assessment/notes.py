@@ -9,7 +9,7 @@ import numpy as np
 from rigidfleet._common.text import agent_names, first_few
 from rigidfleet.assessment.avoidance import avoidance_notes, clock_notes
 from rigidfleet.assessment.checks import abandonment_check
-from rigidfleet.assessment.fits import angle_between
+from rigidfleet.assessment.fits import degrees_between
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import DIP, FLIPPED, PhaseVerdict, value
 
@@ -21,7 +21,7 @@ _NAMED = 20
 
 def verdict_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     """Facts that fail no check but that a reader should know."""
-    yield from _abandonment_notes(measured)
+    yield from _abandoned_phase_notes(measured)
     yield from _negative_height_notes(measured)
     yield from _upside_down_notes(measured, phases)
     yield from _fall_notes(measured)
@@ -99,7 +99,7 @@ def _foreign_flight_notes(measured: Measurements) -> Iterator[str]:
         yield f"{who} {first_few(names, _NAMED)}"
 
 
-def _abandonment_notes(measured: Measurements) -> Iterator[str]:
+def _abandoned_phase_notes(measured: Measurements) -> Iterator[str]:
     """Note each phase that was left for another one before it arrived."""
     result = measured.result
     yield from (check.message for check in abandonment_check(measured))
@@ -160,7 +160,7 @@ def _upside_down_notes(measured: Measurements, phases: list[PhaseVerdict]) -> It
         if not p.finished or fit.error > fit.limit:
             continue
         normal, since = seen.setdefault(p.formation, (fit.turned_axis, p.t_end))
-        if angle_between(normal, fit.turned_axis) > FLIPPED:
+        if degrees_between(normal, fit.turned_axis) > FLIPPED:
             yield (
                 f"'{p.formation}' turns over between {since:.2f} s and {p.t_end:.2f} s;"
                 " no attitude is commanded"

@@ -124,7 +124,7 @@ def assess(
         "units": units, "axes": axes, "topic": topic, "origin": origin, "noise": noise, "clock": clock,
     }  # fmt: skip
     chosen = [key for key, value in options.items() if value is not None]
-    plan = _is_plan(files[0])
+    plan = _is_mission_or_result(files[0])
     planned: Result | Mission | None = None
     if plan:
         planned = Result.load(files[0]) if files[0].suffix == ".nc" else as_mission(str(files[0]))
@@ -190,7 +190,7 @@ def assess(
     return {"passed": PASSED, "failed": FAILED, "undecided": UNDECIDED}[verdict.word]
 
 
-def _is_plan(file: Path) -> bool:
+def _is_mission_or_result(file: Path) -> bool:
     """Whether a file is a mission or a result, or the name of a shipped mission."""
     from rigidfleet.mission import mission_names
 

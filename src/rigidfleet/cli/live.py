@@ -51,7 +51,7 @@ def live(
     place.check_folder_writable()
 
     def save_flight(result: Result) -> str:
-        files = Files(place.folder, result.mission.name).make_new_folder()
+        files = Files(place.folder, result.mission.name).make_unique_folder()
         console.show_verdict(files.save(result))
         files.print_paths()
         return f"Saved in {files.result}."

@@ -79,7 +79,7 @@ class Files:
         except OSError as error:
             raise unwritable_error(self.folder, error) from error
 
-    def make_new_folder(self) -> Files:
+    def make_unique_folder(self) -> Files:
         """Create a new folder: this one, or if it exists, one with a number added to its name.
 
         Raises

@@ -199,7 +199,7 @@ def read_tracks(
             table.lines, table.columns = table.lines[known], [x[known] for x in every]
             time, values = time[known], {k: x[known] for k, x in values.items()}
         place = stack(main.place, slice(None))
-        groups, identity = _rows_of_vehicles(table, time, place, columns, stem, notes)
+        groups, identity = _rows_and_name_columns(table, time, place, columns, stem, notes)
         lost = [x for k in identity for x in {*every[k].tolist()} - {*table.columns[k].tolist()}]
         if lost or not groups:
             raise fault(f"{min(lost, default=stem)!r} has no position", "Leave it out")
@@ -245,7 +245,7 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
     sets: dict[str, _Places] = {}
     loose: dict[str, dict[str, int]] = {}
     for who in dict.fromkeys(who for _, who in table.places):
-        place, turned = table.position_columns(axes, who)
+        place, turned = table.position_columns_and_axes(axes, who)
         kinds = ("vx", "vy", "vz"), ("yaw",), ("qx", "qy", "qz", "qw")
         if place:
             sets[who] = _Places(
@@ -276,7 +276,7 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
     return flown
 
 
-def _rows_of_vehicles(
+def _rows_and_name_columns(
     table: TextTable, time: Floats, place: Floats, used: list[int], stem: str, notes: list[str]
 ) -> tuple[dict[str, Ints], list[int]]:
     """Rows of each vehicle, and the columns that tell them apart: by their names, or by the rows themselves.

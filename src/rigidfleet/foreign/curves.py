@@ -112,7 +112,7 @@ def curve_to_rows(curve: Piecewise) -> list[list[float]]:
     return np.column_stack([np.diff(curve.time), flat]).tolist()
 
 
-def greatest_jumps(curve: Piecewise) -> tuple[Floats, Floats]:
+def greatest_jumps_and_times(curve: Piecewise) -> tuple[Floats, Floats]:
     """Greatest jumps (3,) of position, velocity and acceleration at inner knots [m, m/s, m/s^2], and when (3,) [s]."""
     far = np.linalg.norm(curve.jumps(3)[..., :3], axis=-1)
     if not far.size:

@@ -127,7 +127,7 @@ def read_trajectories(
     if several and any(part.read[0].get("clock") == logs.GNSS for part in parts):
         notes.insert(0, f"the clock that vehicles have in common is {logs.GNSS}")
     every = (part.read[0] for part in parts if part.read)
-    if words := logs.frames_in_words(
+    if words := logs.mixed_frames_in_words(
         {x["frame"] for x in every if "frame" in x and "origin" not in x}
     ):
         if not topics:

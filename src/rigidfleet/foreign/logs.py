@@ -199,7 +199,7 @@ def natural_sort_key(name: object) -> list[tuple[int, str]]:
 ONE_FRAME = "Name topics of one frame: --topic"
 
 
-def frames_in_words(frames: Collection[str]) -> str:
+def mixed_frames_in_words(frames: Collection[str]) -> str:
     """That vehicles are in several frames; "" if all are in one."""
     several = (
         f"positions are in frames {first_few(sorted(frames))}: where one is in another is not known"
@@ -248,12 +248,12 @@ def trajectories_of(
     samples = [(seconds(x.time), x.place, x.yaw) for x in every]
     curves = [curve_through_samples(*own, interpolation, str) for own in samples]
     frames = {track.frame if track.origin is None else "geodetic" for track in every}
-    if words := frames_in_words(frames):
+    if words := mixed_frames_in_words(frames):
         if not topics:
             raise fault(words, ONE_FRAME)
         notes[words] = [""]
     if not topics and all(who == track.topic for who, track in tracks.items()):
-        _refuse_duplicates([*tracks], curves)
+        _refuse_coincident([*tracks], curves)
     record: dict[str, Any] = {
         "topics": [*dict.fromkeys(track.topic for track in every)][:20], "frame": next(iter(every)).frame,
         "clock": log.clock or "the vehicle's own, from its start", "since_1970_ns": zero or None,
@@ -272,7 +272,7 @@ def trajectories_of(
     )  # fmt: skip
 
 
-def _refuse_duplicates(names: list[str], curves: list[Piecewise]) -> None:
+def _refuse_coincident(names: list[str], curves: list[Piecewise]) -> None:
     """Refuse two topics that are at one place most of the time.
 
     Raises

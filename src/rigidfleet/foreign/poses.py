@@ -165,7 +165,7 @@ def _read_positions(path: Path, unread: dict[str, str]) -> Iterator[_Place]:
             layout = _message_layout(definition, data[1:2] == b"\1") if own else None
             count[topic] += 1
             try:
-                for who, frame, stamp, numbers in _decode_positions(kind, layout, data):
+                for who, frame, stamp, numbers in _stamped_positions(kind, layout, data):
                     yield f"{topic}{who}", (kind, layout, frame), stamp, received, numbers
             except struct.error:
                 where = f"{topic}: message {count[topic]}"
@@ -226,7 +226,7 @@ def _message_layout(definition: str, little: bool) -> np.dtype[Any]:
     return np.dtype({"names": [*fields], "formats": forms, "offsets": offsets, "itemsize": at})
 
 
-def _decode_positions(
+def _stamped_positions(
     kind: str, layout: np.dtype[Any] | None, data: bytes
 ) -> Iterator[tuple[str, str, int, Sequence[float]]]:
     """Body ("" if the topic is of one), frame, stamp [ns] or 0, and numbers of each position in a message."""
@@ -246,22 +246,22 @@ def _decode_positions(
         at += size * len(values)
         return values
 
-    def unpack_text() -> str:
+    def next_text() -> str:
         nonlocal at
         (length,) = read("I")
         at += length
         return bytes(data[at - length : at - 1]).decode(errors="replace")
 
     for _ in range(*read("I") if kind == "TFMessage" else (1,)):
-        stamp, frame = read("i")[0] * _BILLION + read("I")[0], unpack_text()
+        stamp, frame = read("i")[0] * _BILLION + read("I")[0], next_text()
         if kind == "NamedPoseArray":
-            yield from ((f":{unpack_text()}", frame, stamp, read("7d")) for _ in range(*read("I")))
+            yield from ((f":{next_text()}", frame, stamp, read("7d")) for _ in range(*read("I")))
             return
         if kind == "NavSatFix":
             fixed = read("b")[0] >= 0 and read("H")
             yield "", frame, stamp, read("3d") if fixed else (math.nan,) * 3
             return
-        who = f":{unpack_text()}" if kind in ("TransformStamped", "TFMessage", "Odometry") else ""
+        who = f":{next_text()}" if kind in ("TransformStamped", "TFMessage", "Odometry") else ""
         yield who if kind != "Odometry" else "", frame, stamp, read(f"{_NUMBERS[kind]}d")
 
 

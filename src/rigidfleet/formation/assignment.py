@@ -39,7 +39,7 @@ def closest_approach(
     share : share of the path at which they are nearest, in [0, 1]
     """
     best = np.inf, (0, 0), 0.0
-    for i, separation, s in _closest_approaches(start, end, radius):
+    for i, separation, s in _approaches_to_later_agents(start, end, radius):
         k, j = np.unravel_index(int(separation.argmin()), separation.shape)
         if separation[k, j] < best[0]:
             best = float(separation[k, j]), (int(i[k]), int(i[0] + 1 + j)), float(s[k, j])
@@ -49,13 +49,13 @@ def closest_approach(
 def pairs_nearer_than(distance: float, start: ArrayLike, end: ArrayLike) -> Ints:
     """Pairs (m, 2), i < j, of agents that come nearer than a distance [m] on straight ways in step (N, 3) [m]."""
     pairs = [np.zeros((0, 2), dtype=np.int64)]
-    for i, separation, _ in _closest_approaches(start, end, None):
+    for i, separation, _ in _approaches_to_later_agents(start, end, None):
         k, j = np.nonzero(separation < distance)
         pairs.append(np.column_stack([i[k], i[0] + 1 + j]))
     return np.concatenate(pairs)
 
 
-def _closest_approaches(
+def _approaches_to_later_agents(
     start: ArrayLike, end: ArrayLike, radius: ArrayLike | None
 ) -> Iterator[tuple[Ints, Floats, Floats]]:
     """Of some agents (k,), in turn all: least separation from each later one (k, m), and the share of the way there.

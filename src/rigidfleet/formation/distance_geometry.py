@@ -60,7 +60,7 @@ def violations(edges: ArrayLike, lengths: ArrayLike) -> list[Violation]:
     for i, j in pairs:
         after[i].add(j)
     broken: list[Violation] = []
-    for size, excess_of in ((3, _triangle_inequality_excess), (4, _squared_volumes)):
+    for size, excess_of in ((3, _triangle_excess_and_violations), (4, _squared_volumes)):
         cliques = list(_cliques(after, size))
         numbers = (index[pair] for agents in cliques for pair in combinations(agents, 2))
         sides = np.fromiter(numbers, np.int64).reshape(-1, size * (size - 1) // 2)
@@ -85,7 +85,7 @@ def _cliques(after: dict[int, set[int]], size: int) -> Iterator[tuple[int, ...]]
     return extend((), set(after))
 
 
-def _triangle_inequality_excess(sides: Floats) -> tuple[Floats, Floats]:
+def _triangle_excess_and_violations(sides: Floats) -> tuple[Floats, Floats]:
     """By how much the longest side of triangles (K, 3) [m] is too long, and where that is no rounding."""
     longest = sides.max(axis=1)
     excess = 2 * longest - sides.sum(axis=1)
@@ -101,7 +101,7 @@ def _squared_volumes(sides: Floats) -> tuple[Floats, Floats]:
     return volume2, volume2 < -REALISABLE * squares.max(axis=0) ** 3
 
 
-def classical_scaling(d: Floats) -> tuple[Floats, Floats]:
+def gram_eigensystem(d: Floats) -> tuple[Floats, Floats]:
     """Squared extents (N,) [m^2] and axes (N, N) of points with distances (N, N) [m]: classical scaling."""
     centring = np.eye(len(d)) - 1 / len(d)
     return np.linalg.eigh(-0.5 * centring @ d**2 @ centring)
@@ -129,7 +129,7 @@ def slots_from_distances(n: int, edges: ArrayLike, lengths: ArrayLike) -> Floats
         return None
     d = np.zeros((n, n))
     d[e[:, 0], e[:, 1]] = d[e[:, 1], e[:, 0]] = length
-    value, vector = classical_scaling(d)
+    value, vector = gram_eigensystem(d)
     # An eigenvalue is a squared extent; rounding errors alone are no thickness.
     top = np.where(value[-3:] > 1e-12 * value[-1], value[-3:], 0.0)[::-1]
     p = np.zeros((n, 3))

@@ -36,14 +36,14 @@ def neighbour_edges(points: ArrayLike, reach: float = REACH) -> Ints:
     """
     from scipy.spatial import KDTree
 
-    distance = _max_neighbour_distance(points, reach)
+    distance = _neighbour_range(points, reach)
     pairs = KDTree(points).query_pairs(distance, output_type="ndarray")
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].astype(np.int64)
 
 
 def count_neighbour_edges(points: ArrayLike, reach: float = REACH) -> int:
     """Number of edges that `neighbour_edges` would return, without building them."""
-    return count_pairs_within(points, _max_neighbour_distance(points, reach))
+    return count_pairs_within(points, _neighbour_range(points, reach))
 
 
 def count_pairs_within(points: ArrayLike, distance: float) -> int:
@@ -54,7 +54,7 @@ def count_pairs_within(points: ArrayLike, distance: float) -> int:
     return (int(tree.count_neighbors(tree, distance)) - tree.n) // 2
 
 
-def _max_neighbour_distance(points: ArrayLike, reach: float) -> float:
+def _neighbour_range(points: ArrayLike, reach: float) -> float:
     """Greatest distance [m] between neighbours among points (N, 3); infinite for a single one."""
     p = np.asarray(points, dtype=np.float64)
     return reach * float(np.median(nearest(p))) * (1 + 1e-9)

@@ -168,7 +168,7 @@ def _read_point_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None
     if bare and re.search(rb"(^|,)\s*-?0\d", data, re.MULTILINE):
         remedy = "if commas are decimal marks, separate numbers by semicolons"
         raise fault("has numbers such as 00", remedy)
-    columns, axes = table.position_columns()
+    columns, axes = table.position_columns_and_axes()
     if not (columns := columns or table.find_columns("x", "y")):
         raise table.missing_columns_error("x", "y")
     if (time := table.find_columns("time")) and len(table.codes(time[0])[1]) > 1:

@@ -71,7 +71,7 @@ def _sphere(size: Floats, n: int) -> Floats:
     return p * size[0] / nearest(p).min()
 
 
-def _shells(size: Floats, n: int) -> Floats:
+def _two_spheres(size: Floats, n: int) -> Floats:
     """Two concentric spheres, the outer one first; their distance is that of neighbours on each sphere."""
 
     def sphere_radius(count: int) -> float:
@@ -177,7 +177,7 @@ SHAPES: dict[str, Shape] = {
     "shells": Shape(
         range(40, _ANY),
         1,
-        _shells,
+        _two_spheres,
         "a sphere and, `size` below it, a second one within; each as `sphere`, the outer first",
     ),
     "helix": Shape(

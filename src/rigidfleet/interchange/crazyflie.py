@@ -109,7 +109,7 @@ def write_compressed(motion: ExportedMotion, tolerance: float) -> Iterator[_Imag
         )
     # Times are whole milliseconds.
     near, turned = tolerance - COMPRESSED_ROUNDING, YAW_TOLERANCE - _TENTH
-    ways = (way.refine(np.round(way.time / _MS) * _MS) for way in motion.curve_chunks())
+    ways = (way.with_knots(np.round(way.time / _MS) * _MS) for way in motion.curve_chunks())
     curves = fit_curves(ways, near, yaw_tolerance=turned, longest=_LONGEST * _MS)
     for number, curve in enumerate(curves, 1):
         yield _compressed_image(curve, number)

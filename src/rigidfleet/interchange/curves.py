@@ -91,15 +91,15 @@ def fit_curves(
         Not even a piece between two samples is within the tolerance.
     """
     for some in ways:
-        yield from _fit_curves_together(some, tolerance, orders, yaw_tolerance, longest)
+        yield from _fit_curves_in_rounds(some, tolerance, orders, yaw_tolerance, longest)
 
 
-def _fit_curves_together(
+def _fit_curves_in_rounds(
     source: Piecewise, tolerance: float, orders: int, yaw_tolerance: float, longest: float
 ) -> Iterator[Piecewise]:
     """`fit_curves` of ways (K, N, 4, P): in each round, every vehicle tries a piece of its own length."""
     time, (n, vehicles) = source.time, source.pieces.shape[:2]
-    begin, end = source.states_at_ends(orders)
+    begin, end = source.piece_end_states(orders)
     t = time[:-1] + np.diff(time) * _CHECKED[:, None]
     # Points are the last axis: arithmetic on long rows is fast.
     wanted = source.at_shares(_CHECKED).transpose(3, 1, 2, 0).reshape(4, len(_CHECKED), -1)
@@ -155,12 +155,12 @@ def _fit_curves_together(
 
 
 def cubic_curves(motion: ExportedMotion, tolerance: float) -> Iterator[Piecewise]:
-    """For each vehicle its way in cubic pieces, from time zero on; see `heading_knots`."""
+    """For each vehicle its way in cubic pieces, from time zero on; see `yaw_knots`."""
     for curve in fit_curves(motion.curve_chunks(), tolerance, 2, YAW_TOLERANCE / 2):
         yield curve.shift_time(-motion.start)
 
 
-def heading_knots(curve: Piecewise) -> tuple[Floats, Floats]:
+def yaw_knots(curve: Piecewise) -> tuple[Floats, Floats]:
     """Times (K,) [s] and yaws (K,) [rad] with lines between them, within half of `YAW_TOLERANCE` of a way.
 
     Times increase: where yaw jumps, it turns within a millisecond. A line turns by 90 deg at most: from half a turn on,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.foreign.curves import with_headings
-from rigidfleet.interchange.curves import ExportedMotion, cubic_curves, heading_knots
+from rigidfleet.interchange.curves import ExportedMotion, cubic_curves, yaw_knots
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result import lights
 from rigidfleet.typing import Floats, Ints
@@ -71,10 +71,10 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     nodes, samplers, channels = [], [], []
     radii = motion.result.mission.fleet.radius.tolist()
     for agent, curve in enumerate(cubic_curves(motion, tolerance)):
-        times, yaws = heading_knots(curve)
+        times, yaws = yaw_knots(curve)
         turned = np.stack([0 * yaws, np.sin(yaws / 2), 0 * yaws, np.cos(yaws / 2)], axis=1)
         for path, time, values, way in (
-            ("translation", curve.time, _spline_rows(curve), "CUBICSPLINE"),
+            ("translation", curve.time, _hermite_rows(curve), "CUBICSPLINE"),
             ("rotation", times, turned, "LINEAR"),
         ):
             keys = {"input": file.add_array(time, bounds=True), "output": file.add_array(values)}
@@ -169,9 +169,9 @@ def read_gltf(data: bytes) -> list[Piecewise]:
     return curves
 
 
-def _spline_rows(curve: Piecewise) -> Floats:
+def _hermite_rows(curve: Piecewise) -> Floats:
     """Rows (3 K, 3) of a cubic spline: for each key the velocity before, the position and the velocity after."""
-    begin, end = (x[..., :3].swapaxes(0, 1) for x in curve.states_at_ends(2))
+    begin, end = (x[..., :3].swapaxes(0, 1) for x in curve.piece_end_states(2))
     rows = np.zeros((len(curve.time), 3, 3))
     rows[1:, :2], rows[:-1, 1:] = end[:, ::-1], begin
     return _z_up_to_y_up(rows.reshape(-1, 3))

@@ -19,7 +19,7 @@ import numpy as np
 
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.shows import read_show
-from rigidfleet.interchange.curves import ExportedMotion, cubic_curves, heading_knots
+from rigidfleet.interchange.curves import ExportedMotion, cubic_curves, yaw_knots
 from rigidfleet.interchange.lights import light_program
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result.lights import light_fades
@@ -52,7 +52,7 @@ def write_skyc(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
         off = round(float(motion.result.motors_off[agent]) - motion.start, 6)
         span = {"takeoffTime": 0, "landingTime": min(off, points[-1][0])}
         files[f"{folder}/trajectory.json"] = {"version": 1, "points": points, **span}
-        times, yaws = heading_knots(curve)
+        times, yaws = yaw_knots(curve)
         clockwise = -np.degrees(yaws)
         clockwise -= 360.0 * np.floor(clockwise[0] / 360.0)
         setpoints = np.column_stack([times.round(6), clockwise.round(4)]).tolist()

@@ -50,7 +50,7 @@ needed_rate = jit_inline(_needed_rate)
 
 
 @jit
-def reduce_edge_forces(p, w, state, a):
+def weaken_edge_forces(p, w, state, a):
     """Take from the forces of edges what they let go, and from their integrals what the tick has added to it.
 
     All edges let go by one share, that of the vehicle that is pushed most: where edges are redundant, forces of single
@@ -210,7 +210,7 @@ def push_apart(i, j, n, force, a):
 
 
 @jit
-def edge_softness(e, p, a):
+def edge_compliance(e, p, a):
     """What an edge adds to its own diagonal of A: the law's damping, and more the less it holds."""
     i, j = p.graph.edges[e, 0], p.graph.edges[e, 1]
     hold = max(min(a.hold[i], a.hold[j]), _LOOSE)
@@ -218,7 +218,7 @@ def edge_softness(e, p, a):
 
 
 @jit
-def relax_barrier(k, a):
+def enforce_barrier(k, a):
     """Let barrier k push as it must with the present accelerations; returns the change that it makes [m/s^2]."""
     i, j, n = a.rows[k, 0], a.rows[k, 1], a.normals[k]
     rest = a.missing[k] - difference_along(i, j, n, a.shift)
@@ -233,7 +233,7 @@ def relax_barrier(k, a):
 
 
 @jit
-def relax_edges(p, w, a):
+def update_edge_pulls(p, w, a):
     """The same for all edges."""
     change = 0.0
     for e in range(p.graph.edges.shape[0]):
@@ -241,7 +241,7 @@ def relax_edges(p, w, a):
         along = difference_along(i, j, n, a.shift)
         if along == 0.0 and a.pull[e] == 0.0:
             continue
-        soft, diagonal = edge_softness(e, p, a), p.graph.diagonal[e]
+        soft, diagonal = edge_compliance(e, p, a), p.graph.diagonal[e]
         pull = -_BEYOND * (along + soft * a.pull[e]) / (diagonal + soft)
         change = max(change, abs(pull) * diagonal)
         push_apart(i, j, n, pull, a)
@@ -257,16 +257,16 @@ def sweep_gauss_seidel(count, p, w, a):
     """
     first, pushing = 0.0, 0
     for k in range(count):
-        first = max(first, relax_barrier(k, a))
+        first = max(first, enforce_barrier(k, a))
         if a.push[k] > 0.0:
             a.pushing[pushing] = k
             pushing += 1
-    first = max(first, relax_edges(p, w, a))
+    first = max(first, update_edge_pulls(p, w, a))
     for _ in range(_INNER if first >= _CLOSE else 0):
         change = 0.0
         for k in range(pushing):
-            change = max(change, relax_barrier(a.pushing[k], a))
-        if max(change, relax_edges(p, w, a)) < _CLOSE:
+            change = max(change, enforce_barrier(a.pushing[k], a))
+        if max(change, update_edge_pulls(p, w, a)) < _CLOSE:
             break
     return first
 
@@ -315,7 +315,7 @@ def solve_active_set(count, p, w, a):
         if row < size:
             a.right[row] += a.missing[a.active[row]]
         else:
-            soft = edge_softness(row - size, p, a)
+            soft = edge_compliance(row - size, p, a)
             a.system[row, row] += soft
             a.right[row] -= soft * a.pull[row - size]
     if not cholesky(a.system[:whole, :whole]):

@@ -179,7 +179,7 @@ def precondition(R, place, column, row, L, r, w, z):
 
 
 @jit
-def apply_J(u, edges, a, scale, out):
+def add_J_product(u, edges, a, scale, out):
     """out (m,) += scale J a, for a (N, 3)."""
     for k in range(edges.shape[0]):
         i, j = edges[k, 0], edges[k, 1]
@@ -191,7 +191,7 @@ def apply_J(u, edges, a, scale, out):
 
 
 @jit
-def apply_Jt(u, edges, b, scale, out):
+def add_Jt_product(u, edges, b, scale, out):
     """out (N, 3) += scale J^T b, for b (m,)."""
     for k in range(edges.shape[0]):
         i, j = edges[k, 0], edges[k, 1]
@@ -202,7 +202,7 @@ def apply_Jt(u, edges, b, scale, out):
 
 
 @jit_inline
-def multiply_by_K(u, edges, m, mbar, mu, a, out):
+def multiply_by_agent_K(u, edges, m, mbar, mu, a, out):
     """out = K a for (N, 3) arrays."""
     for i in range(m.shape[0]):
         s = mu * m[i]
@@ -285,7 +285,7 @@ def conjugate_gradients(u, edges, m, mbar, mu, R, place, column, row, L, g, x, w
     """
     r, z, q, Kq, w = work[0], work[1], work[2], work[3], work[4]
     n = m.shape[0]
-    multiply_by_K(u, edges, m, mbar, mu, x, Kq)
+    multiply_by_agent_K(u, edges, m, mbar, mu, x, Kq)
     for i in range(n):
         for s in range(3):
             r[i, s] = g[i, s] - Kq[i, s]
@@ -300,7 +300,7 @@ def conjugate_gradients(u, edges, m, mbar, mu, R, place, column, row, L, g, x, w
             for s in range(3):
                 q[i, s] = z[i, s] + (rz / last) * q[i, s]
         last = rz
-        multiply_by_K(u, edges, m, mbar, mu, q, Kq)
+        multiply_by_agent_K(u, edges, m, mbar, mu, q, Kq)
         step = rz / inner(q, Kq)
         rest = 0.0
         for i in range(n):

@@ -24,14 +24,14 @@ def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, f_C):
         centre_of_mass(r, m, M, cm)
         inertia(r, m, cm, I)
         inertia_inverse(I, I_inv)
-    pivot = solve_agent_by_agent(u, b, order, a)
+    pivot = solve_J_agent_by_agent(u, b, order, a)
     if pivot > LOST_PIVOT:
         balanced_forces(r, m, M, cm, I_inv, a, f_C)
     return pivot
 
 
 @jit_inline
-def solve_agent_by_agent(u, b, order, a):
+def solve_J_agent_by_agent(u, b, order, a):
     """Write into a (N, 3) a solution of J a = b, agent by agent; return the smallest pivot.
 
     An edge to agent j requires u . a_i = +-b + u . a_j. If an agent has fewer than three edges, the shortest

@@ -98,7 +98,7 @@ class VehicleDynamics:
         """Speed [rad/s] of a rotor with a thrust [N]."""
         return speed_of(np.asarray(thrust, dtype=float), *_as_three_floats(self.thrust))
 
-    def allocation_matrix(self, g: float) -> Floats:
+    def wrench_to_rotors(self, g: float) -> Floats:
         """Matrix (4, 4) from thrust [N] and torque [N m] to the rotors' forces.
 
         The ratio of a rotor's torque to its thrust is that at hover; without gravity, that at half the greatest thrust.
@@ -352,7 +352,7 @@ def quadrotor_arrays(vehicles: Sequence[VehicleDynamics], g: float = 9.81) -> Qu
     return Quadrotors(
         **{name: parameter_rows(name) for name in names},
         force=np.array([v.rotor_thrust_at(v.speed) for v in vehicles]),
-        unmix=np.array([v.allocation_matrix(g) for v in vehicles]),
+        unmix=np.array([v.wrench_to_rotors(g) for v in vehicles]),
         span=np.array([[gap.min(), gap.max()] for gap in gaps]),
         point=np.array([v.point for v in vehicles]),
         lost=np.zeros(len(vehicles), dtype=np.bool_),
@@ -427,7 +427,7 @@ def initial_state(
     depth = 1 + int(flight.sensing.delay.max())
     known = np.ascontiguousarray(S[:, :6])
     past = np.tile(known, (depth, 1, 1))
-    attitude = _initial_frame(frame)
+    attitude = _frame_at_rest(frame)
     curves = flight.vehicles.thrust.T[:, :, None]
     peak = np.where(flight.vehicles.point[:, None], 0.0, thrust_of(S[:, 13:], *curves))
     worst = np.zeros((n, VERTICAL + 1))
@@ -458,12 +458,12 @@ def state_under_problem(
     state.clock[LAW_TIME], state.count[LAWS] = state.clock[TIME], 0
     n = len(state.S)
     return state._replace(
-        integral=np.array(integral, dtype=float), frame=_initial_frame(frame),
+        integral=np.array(integral, dtype=float), frame=_frame_at_rest(frame),
         work=_new_work_arrays(n, len(workspace.c)),
     )  # fmt: skip
 
 
-def _initial_frame(q: Floats | None) -> Floats:
+def _frame_at_rest(q: Floats | None) -> Floats:
     """A frame at the start, which has no rates yet."""
     rows = np.zeros((3, 4))
     rows[0] = (1.0, 0.0, 0.0, 0.0) if q is None else q

@@ -29,7 +29,7 @@ from rigidfleet.kernel.avoidance import (
     PAIR,
     TICKS,
 )
-from rigidfleet.kernel.barriers import filter_accelerations, limit_thrust, reduce_edge_forces
+from rigidfleet.kernel.barriers import filter_accelerations, limit_thrust, weaken_edge_forces
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
 from rigidfleet.kernel.fleet import thrust_of
@@ -43,7 +43,7 @@ from rigidfleet.kernel.moving import (
     steer_round_obstacles,
     update_tracks,
     way_to_rest,
-    write_relative_stop,
+    write_stop_relative_to_obstacle,
 )
 from rigidfleet.kernel.rigid_body import attitude_matrix
 from rigidfleet.kernel.sampled_flight import write_measured_states
@@ -108,7 +108,7 @@ def braking_acceleration(i, v, a, out):
 
 
 @jit
-def adopt_candidate(i, far, a):
+def store_candidate(i, far, a):
     """Make the candidate ``trial`` the present choice of vehicle i."""
     trial = a.trial
     a.far[i] = far
@@ -154,7 +154,7 @@ def is_apart(i, v, j, s, floor, a):
 
 
 @jit
-def candidate_is_clear(i, v, far, a):
+def clears_static_obstacles(i, v, far, a):
     """Whether the candidate of vehicle i, with a velocity v (3,), keeps its distances from obstacles at rest."""
     way, normal = a.trial, a.normal
     for o in range(a.solids.kind.shape[0]):
@@ -269,7 +269,7 @@ def greatest_row_norm(x):
 
 
 @jit
-def greatest_relative_move(r, a):
+def greatest_move_since_listing(r, a):
     """Greatest way [m] of a vehicle since neighbours were listed, beside the way that all have gone."""
     # What all have gone together changes no distance: a fleet that travels keeps its lists.
     n, farthest = a.b.shape[0], 0.0
@@ -293,7 +293,7 @@ def update_neighbours(r, v, lost, a):
     due = a.count[LISTED] == 0 or fastest > a.span[1] or hardest > a.span[2]
     # Nor for speeds far below those for which it was made
     due = due or 2.5 * fastest + _LEAST_SPEED < 0.8 * a.span[1]
-    if not (due or 2.0 * greatest_relative_move(r, a) > a.span[0]):
+    if not (due or 2.0 * greatest_move_since_listing(r, a) > a.span[0]):
         return True
     speed, hard = (1.0 + _FASTER) * fastest + _LEAST_SPEED, (1.0 + _FASTER) * hardest + 1.0
     way = interaction_range(speed, hard, a)
@@ -326,14 +326,14 @@ def is_alone(i, a):
 
 
 @jit
-def set_obstacle_distance_floor(t, i, o, r, v, closest, a):
+def set_obstacle_distance_to_keep(t, i, o, r, v, closest, a):
     """Find the distance that the relative stop segment of vehicle i keeps from obstacle o, which moves.
 
     Returns the least by which such a segment exceeds what it needs so far, at most 0; `threat` is its obstacle.
     """
     if not is_obstacle_known(o, a):
         return closest
-    stop, speed = write_relative_stop(i, o, r, v, a)
+    stop, speed = write_stop_relative_to_obstacle(i, o, r, v, a)
     need, way = (
         required_obstacle_distance(i, o, speed, relative_braking_limit(i, o, a), a),
         a.shifted,
@@ -366,7 +366,7 @@ def brake_and_set_distances(t, r, v, lost, a):
         for q in range(3):
             a.ways[i, 3, q] = r[i, q] + stop / max(speed, 1e-12) * v[i, q]
         # It stays on the stop segment, also after the tick
-        adopt_candidate(i, max(predict_motion(i, r[i], v[i], acceleration, a, a.trial), stop), a)
+        store_candidate(i, max(predict_motion(i, r[i], v[i], acceleration, a, a.trial), stop), a)
     # A vehicle that is nearer than it should be keeps what it has: a floor that nobody meets would stop all.
     for i in range(n):
         if lost[i]:
@@ -389,7 +389,7 @@ def brake_and_set_distances(t, r, v, lost, a):
         a.threat[i], a.late[i], closest = -1, 0.0, 0.0
         for o in range(a.solids.kind.shape[0]):
             if a.sight.moves[o] != 0:
-                closest = set_obstacle_distance_floor(t, i, o, r[i], v[i], closest, a)
+                closest = set_obstacle_distance_to_keep(t, i, o, r[i], v[i], closest, a)
                 a.late[i] = closest
                 continue
             need = a.reach[i] + a.spare[i]
@@ -411,7 +411,7 @@ def is_safe(i, r, v, far, a):
         reach = a.floor[e] + far + a.far[j]
         if x * x + y * y + z * z < reach * reach and not is_apart(i, v[i], j, v[j], a.floor[e], a):
             return False
-    return candidate_is_clear(i, v[i], far, a)
+    return clears_static_obstacles(i, v[i], far, a)
 
 
 @jit
@@ -476,14 +476,14 @@ def choose_acceleration(i, r, v, a):
             continue
         best, nearest = away, k
         if k == 0:
-            adopt_candidate(i, far, a)
+            store_candidate(i, far, a)
             return 0
     if nearest < 0:
         if second < 0 or least_margin_if_braking(i, r, v, late, a) >= most:
             return 2
         nearest = second
     propose_acceleration(i, nearest, v[i], a, c)
-    adopt_candidate(i, predict_motion(i, r[i], v[i], c, a, a.trial), a)
+    store_candidate(i, predict_motion(i, r[i], v[i], c, a, a.trial), a)
     return 1
 
 
@@ -565,7 +565,7 @@ def guard_forces(p, w, flight, state, a):
     n, lost, t = a.b.shape[0], flight.vehicles.lost, state.work.law_time[0]
     r, v, k = a.known[0], a.known[1], state.count[FLIGHT_TICKS]
     if a.filtered:
-        reduce_edge_forces(p, w, state, a)
+        weaken_edge_forces(p, w, state, a)
     write_measured_states(k, r, v, flight, state)
     for i in range(n):
         wanted_acceleration(i, state, a)

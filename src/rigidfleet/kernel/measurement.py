@@ -53,7 +53,7 @@ def fit_quaternion(B, bound, K, V, w, q):
         + B[0, 2] * (B[1, 0] * B[2, 1] - B[1, 1] * B[2, 0])
     )
     second, first = -2.0 * size, -8.0 * det
-    last = determinant(K)
+    last = determinant_4x4(K)
     x = min(math.sqrt(3.0 * size), bound)
     for _ in range(60):
         square = x * x
@@ -68,7 +68,7 @@ def fit_quaternion(B, bound, K, V, w, q):
     # The eigenvector is a column of the adjugate; the longest one is accurate.
     most = 0.0
     for i in range(4):
-        length = cofactors(K, i, V[1])
+        length = cofactor_row(K, i, V[1])
         if length > most:
             most = length
             for j in range(4):
@@ -90,7 +90,7 @@ def fit_quaternion(B, bound, K, V, w, q):
 
 
 @jit
-def cofactors(K, i, out):
+def cofactor_row(K, i, out):
     """Row i of the cofactors of K (4, 4) into out (4,); returns the square of their length."""
     a, b, c = K[0], K[1], K[2]
     if i < 3:
@@ -114,7 +114,7 @@ def cofactors(K, i, out):
 
 
 @jit
-def determinant(K):
+def determinant_4x4(K):
     """Determinant of K (4, 4)."""
     s0, s1 = K[0, 0] * K[1, 1] - K[1, 0] * K[0, 1], K[0, 0] * K[1, 2] - K[1, 0] * K[0, 2]
     s2, s3 = K[0, 0] * K[1, 3] - K[1, 0] * K[0, 3], K[0, 1] * K[1, 2] - K[1, 1] * K[0, 2]
@@ -161,7 +161,7 @@ def choose_quaternion_sign(q, last):
 
 
 @jit
-def width_and_length(p, mass, C, V, w, axis):
+def width_length_and_axis(p, mass, C, V, w, axis):
     """Width and length of slots p (N, 3) of a ``mass`` (N,); the direction of the length into ``axis`` (3,).
 
     For slots too wide to be a line, two numbers with a ratio that shows this, and no axis.
@@ -311,7 +311,7 @@ def measure_slot_attitude(m, k, known, line_known, near, work, T):
     B, K, V, w, axis, size = work[0], work[1], work[2], work[3, 0], work[7, 0], work[7, 1]
     n = x.shape[0]
     if not line_known:
-        size[0], size[1] = width_and_length(p, mass, K, V, w, axis)
+        size[0], size[1] = width_length_and_axis(p, mass, K, V, w, axis)
     width, length = size[0], size[1]
     line = width <= _THIN * length
     if line or (known and width <= _NARROW * length):
@@ -366,7 +366,7 @@ def measure_samples(m):
                 for i in range(n):
                     for a in range(3):
                         same = same and m.p[k, i, a] == m.p[k - 1, i, a]
-            measure_motion(m, k, mass, M)
+            measure_cm_and_wrench(m, k, mass, M)
             line = False
             if m.attached[piece]:
                 centre_of_mass(m.p[k], mass, M, centre)
@@ -431,7 +431,7 @@ def vector_length(x, y, z):
 
 
 @jit
-def measure_motion(m, k, mass, M):
+def measure_cm_and_wrench(m, k, mass, M):
     """Centre of mass, wrench, thrust and distances at sample k; agents about their centre of mass into ``m.x``."""
     r, v, f, g = m.r[k], m.v[k], m.f_u[k], m.f_C[k]
     n = r.shape[0]

@@ -117,7 +117,7 @@ def count_pieces(angle):
 
 
 @jit
-def find_frames_over_step(points, part, parts, p, monitor):
+def write_body_frames(points, part, parts, p, monitor):
     """Attitude, centre and its velocity at five knots of a piece of a step, in the body formulation."""
     first = 6 * p.vehicles.m.shape[0] + p.graph.edges.shape[0]
     quaternion = monitor.scratch[0]
@@ -444,7 +444,7 @@ def watch_step_distances(step, p, state, monitor):
     for part in range(parts):
         start = t + part * h
         if p.body_formulation:
-            find_frames_over_step(points, part, parts, p, monitor)
+            write_body_frames(points, part, parts, p, monitor)
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
                 continue
@@ -625,7 +625,7 @@ def step_end_time(step, state):
 
 
 @jit
-def watch_isolated_step_forces(step, before, after, p, w, state, monitor):
+def watch_single_step_forces(step, before, after, p, w, state, monitor):
     """Search a step that has no neighbour, because of a jump or the end."""
     start, end = state.trail.clock[trail_row_of(step, state), 0], step_end_time(step, state)
     middle, values = 0.5 * (start + end), monitor.gauge[1]
@@ -654,12 +654,12 @@ def watch_forces(last, p, w, state, monitor):
         if new:
             update_force_extremes(after, end, p, monitor)
         if step == 0 and new:
-            watch_isolated_step_forces(0, before, after, p, w, state, monitor)
+            watch_single_step_forces(0, before, after, p, w, state, monitor)
         if step + 1 < steps:
             then, until = trail.gauge[trail_row_of(step + 1, state)], step_end_time(step + 1, state)
             search_forces_in(earlier, after, then, step, start, end, until, p, w, state, monitor)
         elif last and (step > 0 or not new):
-            watch_isolated_step_forces(step, earlier, after, p, w, state, monitor)
+            watch_single_step_forces(step, earlier, after, p, w, state, monitor)
     if last or steps == 0:
         monitor.count[STAYED], state.count[TRAILED] = 0, 0
     else:

@@ -89,7 +89,7 @@ def is_in_sight(o, x, y, z, r, lost, a):
 
 
 @jit
-def observe_obstacle(o, k, x, y, z, u, v, w, a):
+def track_obstacle(o, k, x, y, z, u, v, w, a):
     """Take a measurement of obstacle o at tick k, at the displacement x, y, z [m] with the velocity u, v, w [m/s]."""
     s = a.sight
     track, spread, seen = s.track[o], s.spread[o], a.shifted[0]
@@ -125,7 +125,7 @@ def update_tracks(t, r, lost, a):
         if s.known[o] != UNKNOWN:
             predict_track(o, T, s)
         if not s.reach < math.inf or is_in_sight(o, x, y, z, r, lost, a):
-            observe_obstacle(o, k, x, y, z, u, v, w, a)
+            track_obstacle(o, k, x, y, z, u, v, w, a)
             s.known[o] = FOLLOWED
         if s.known[o] == UNKNOWN:
             continue
@@ -188,7 +188,7 @@ def required_obstacle_distance(i, o, speed, b, a):
 
 
 @jit
-def write_relative_stop(i, o, r, v, a):
+def write_stop_relative_to_obstacle(i, o, r, v, a):
     """Write the relative stop segment of vehicle i to ``shifted`` 0 and 2; returns its length and relative speed."""
     x, out = a.sight.track[o], a.shifted
     speed = 0.0

@@ -12,7 +12,7 @@ _FADES, _WAITS = range(2)
 
 
 @jit
-def mix_bits(x):
+def mix_32_bits(x):
     """A permutation of the integers of 32 bits without pattern (C. Wellons' lowbias32)."""
     x ^= x >> 16
     x = (x * 0x7FEB352D) & 0xFFFFFFFF
@@ -24,11 +24,11 @@ def mix_bits(x):
 @jit
 def random_uniform(seed, kind, link, k):
     """A number in [0, 1) of a link (2,) at tick k: the same one whenever it is drawn."""
-    x = mix_bits(seed[0] ^ kind)
-    x = mix_bits(x ^ seed[1])
-    x = mix_bits(x ^ link[0])
-    x = mix_bits((x + link[1]) & 0xFFFFFFFF)
-    return mix_bits((x + k) & 0xFFFFFFFF) / 4294967296.0
+    x = mix_32_bits(seed[0] ^ kind)
+    x = mix_32_bits(x ^ seed[1])
+    x = mix_32_bits(x ^ link[0])
+    x = mix_32_bits((x + link[1]) & 0xFFFFFFFF)
+    return mix_32_bits((x + k) & 0xFFFFFFFF) / 4294967296.0
 
 
 @jit

@@ -17,11 +17,11 @@ from rigidfleet.kernel.compiler.jit import compiled_copy, jit
 from rigidfleet.kernel.monitor import (
     clearance_to_beat,
     count_pieces,
-    find_frames_over_step,
     frame_rotation_bound,
     note_obstacle_departure,
     store_clearance,
     world_control_points,
+    write_body_frames,
 )
 from rigidfleet.solids.distance import (
     box_distance,
@@ -40,7 +40,7 @@ _SHORTEST = 2.0**-32
 
 
 @jit
-def solid_tangent_plane(x, y, z, b, triangle, s):
+def solid_gap_and_normal(x, y, z, b, triangle, s):
     """As `bernstein.tangent_of_box`, of solid b, or of one of its triangles if that is not -1."""
     if triangle < 0:
         nx, ny, nz = outward_normal(x, y, z, b, s)
@@ -53,11 +53,11 @@ def solid_tangent_plane(x, y, z, b, triangle, s):
 
 
 #: As `distance_to_box`, of solid b or of one of its triangles.
-nearest_along = compiled_copy(distance_to_box, "nearest_along", tangent_of_box=solid_tangent_plane)
+nearest_along = compiled_copy(distance_to_box, "nearest_along", tangent_of_box=solid_gap_and_normal)
 
 
 @jit
-def distance_to_heights(curve, b, floor, pieces, s):
+def distance_to_height_map(curve, b, floor, pieces, s):
     """The same for a height map: the least over its triangles near the curve, and inside the depth at five points."""
     best, at = floor, -1.0
     x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], ball_radius(curve)
@@ -138,7 +138,7 @@ def watch_solid(i, b, curve, t, h, s, monitor):
         floor = clearance_to_beat(i, monitor) + radius
         if not (floor < math.inf and distance_bound(x, y, z, b, s) - ball_radius(own) >= floor):
             if s.kind[b] == HEIGHTS:
-                value, at = distance_to_heights(own, b, floor, monitor.pieces, s)
+                value, at = distance_to_height_map(own, b, floor, monitor.pieces, s)
             else:
                 value, at = nearest_along(own, b, -1, floor, monitor.pieces, s)
             if at >= 0.0:
@@ -183,7 +183,7 @@ def watch_clearances(points, start, length, p, s, monitor):
     for part in range(parts):
         t = start + part * h
         if p.body_formulation:
-            find_frames_over_step(points, part, parts, p, monitor)
+            write_body_frames(points, part, parts, p, monitor)
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
                 continue

@@ -195,7 +195,7 @@ def record_if_worse(i, kind, value, t, state):
 
 
 @jit
-def write_known_states(k, t, p, w, flight, state):
+def write_states_and_plan(k, t, p, w, flight, state):
     """What each vehicle knows at tick k, time t [s], into w: its measured state and, by one clock, the plan."""
     write_measured_states(k, w.r, w.v, flight, state)
     if not flight.clocks.own:
@@ -211,7 +211,7 @@ def evaluate_distributed_law(k, t, dt, p, w, flight, state):
     """
     net, mail, tick, stuck = flight.network, state.mail, flight.steps * flight.h, False
     state.work.law_time[0] = t
-    write_known_states(k, t, p, w, flight, state)
+    write_states_and_plan(k, t, p, w, flight, state)
     state.integral[:] = 0.0
     last = mail.multiplier.shape[1] - 1
     for i in range(state.S.shape[0]):
@@ -266,7 +266,7 @@ def write_measured_states(k, r, v, flight, state):
 
 
 @jit
-def post_messages(k, p, w, flight, state):
+def prepare_messages(k, p, w, flight, state):
     """Have ready what each vehicle could send at tick k: what it knows of itself, and what it does."""
     mail, row = state.mail, k % state.mail.due.shape[1]
     write_measured_states(k, w.r, w.v, flight, state)
@@ -379,7 +379,7 @@ def run_tick(k, t, p, w, flight, state, call):
         if state.saturated[i]:
             state.saturations[i] += 1
     if flight.network.every > 0:
-        post_messages(k, p, w, flight, state)
+        prepare_messages(k, p, w, flight, state)
         if k % flight.network.every == 0:
             decide_broadcasts(k, p, w, flight, state)
             send(k, state.S, flight.network, state.mail)
@@ -549,7 +549,7 @@ def measure_for_laws(k, t, p, w, flight, state):
     measure_states(k, flight, state)
     if flight.commands.kind == OWN:
         receive(k, flight.network, state.mail)
-        write_known_states(k, t, p, w, flight, state)
+        write_states_and_plan(k, t, p, w, flight, state)
 
 
 @jit

@@ -6,7 +6,7 @@ A vector holds eight consecutive states of one flight, or the same state of eigh
 - ``as_lanes(rows)``: float64 rows (k, n), n a multiple of 8, viewed as vectors (k, n / 8); rows of vectors unchanged;
 - ``fill_lanes(x)``: a vector of eight numbers x;
 - ``rough_inverse(v)``: 1/v to four digits, in a fraction of a quotient's time;
-- ``one_flight_sum_or_worst(v, y)``: a vector's sum if y are states of one flight, its greatest number if of eight.
+- ``sum_lanes_or_worst(v, y)``: a vector's sum if y are states of one flight, its greatest number if of eight.
 
 These are names of `rigidfleet.kernel.compiler.simd`. Functions around them would cost the integrator some per cent.
 """
@@ -14,13 +14,13 @@ These are names of `rigidfleet.kernel.compiler.simd`. Functions around them woul
 from rigidfleet.kernel.compiler.simd import (
     as_lanes,
     fill_lanes,
-    one_flight_sum_or_worst,
     rough_inverse,
+    sum_lanes_or_worst,
 )
 
 __all__ = [
     "as_lanes",
     "fill_lanes",
-    "one_flight_sum_or_worst",
     "rough_inverse",
+    "sum_lanes_or_worst",
 ]

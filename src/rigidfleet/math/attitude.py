@@ -34,7 +34,7 @@ def dcm_from_quaternion(q: ArrayLike) -> Floats:
         [2 * (q1 * q2 - q0 * q3), q0**2 - q1**2 + q2**2 - q3**2, 2 * (q2 * q3 + q0 * q1)],
         [2 * (q1 * q3 + q0 * q2), 2 * (q2 * q3 - q0 * q1), q0**2 - q1**2 - q2**2 + q3**2],
     ]
-    return _stack_matrices(rows)
+    return _matrices_of_entries(rows)
 
 
 def _dcm_to_quaternion_products_map() -> Floats:
@@ -111,7 +111,7 @@ def dcm_from_euler(euler: ArrayLike) -> Floats:
         [sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp],
         [cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp],
     ]
-    return _stack_matrices(rows)
+    return _matrices_of_entries(rows)
 
 
 def euler_from_dcm(T: ArrayLike) -> Floats:
@@ -307,7 +307,7 @@ def _check_vectors(name: str, value: ArrayLike, *shape: int) -> Floats:
     return array
 
 
-def _stack_matrices(rows: list[list[Floats]]) -> Floats:
+def _matrices_of_entries(rows: list[list[Floats]]) -> Floats:
     """Matrices (..., 3, 3) of entries (...)."""
     entries = np.array(rows)
     return np.ascontiguousarray(entries.transpose(*range(2, entries.ndim), 0, 1))

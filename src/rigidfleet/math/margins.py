@@ -129,7 +129,7 @@ class LoopGains:
 
 
 @lru_cache
-def reference_error_gain(lag: Lag, laws: LoopGains, drag: float) -> float:
+def tracking_lag_time(lag: Lag, laws: LoopGains, drag: float) -> float:
     """Time T [s] by which a vehicle that tracks leaves its reference at most, in any direction, under either law.
 
     The reference's acceleration, jerk and snap are fed forward past the attitude control, so that only rotors and the
@@ -397,7 +397,7 @@ def stability_margins(loops: Sequence[Loop], law: LoopGains, growth: float = GRO
         return Margins(stable=False)
     low, high, phase, delay = 0.0, math.inf, math.pi, math.inf
     for loop in loops:
-        omega, loci, on_axis = _locus_crossings(loop, law)
+        omega, loci, on_axis = _crossovers(loop, law)
         gain = 1.0 / np.abs(loci[on_axis])
         high = min(high, gain[gain > 1].min(initial=math.inf))
         low = max(low, gain[gain <= 1].max(initial=0.0))
@@ -407,9 +407,9 @@ def stability_margins(loops: Sequence[Loop], law: LoopGains, growth: float = GRO
     return Margins(True, (float(low), float(high)), float(phase), float(delay))
 
 
-def _locus_crossings(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes, Bools]:
+def _crossovers(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes, Bools]:
     """Frequencies (M,) [rad/s] where a locus is negative real or has unit gain; the loci there; which are real."""
-    omega, loci = _logarithms_of_loci(loop, law)
+    omega, loci = _frequencies_and_log_loci(loop, law)
     # Numbers of log(locus) that are whole where a locus is negative real, and that change sign at unit gain.
     numbers = np.stack([(loci.imag - math.pi) / (2 * math.pi), loci.real * 1e-3])
     whole = np.floor(numbers)
@@ -434,7 +434,7 @@ def _locus_crossings(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes, Boo
     return np.exp(x[1]), np.exp(z), kind == 0
 
 
-def _logarithms_of_loci(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes]:
+def _frequencies_and_log_loci(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes]:
     """Frequencies (K,) [rad/s], and the logarithms (K, n) of the loci there, each continuous."""
     end = _top_frequency(loop, law, _FAINT)
     if end <= _FREQUENCIES[0]:

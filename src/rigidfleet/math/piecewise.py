@@ -75,7 +75,7 @@ class Piecewise(NamedTuple):
         """Value and derivatives (orders, T, ...) at times (T,) [s]."""
         return series.taylor_derivatives(self.taylor_coefficients(t, orders))
 
-    def states_at_ends(self, orders: int) -> tuple[Floats, Floats]:
+    def piece_end_states(self, orders: int) -> tuple[Floats, Floats]:
         """Value and derivatives (orders, K, ...) at the beginning and at the end of each piece."""
         times = np.zeros(len(self.pieces)), np.diff(self.time)
         begin, end = (series.polynomial_series(self.pieces, t, orders) for t in times)
@@ -102,7 +102,7 @@ class Piecewise(NamedTuple):
         """The same, begun later [s]."""
         return Piecewise(self.time + start, self.pieces)
 
-    def refine(self, knots: Floats, *, stays: bool = False) -> Piecewise:
+    def with_knots(self, knots: Floats, *, stays: bool = False) -> Piecewise:
         """The same on other knots (K' + 1,) [s], no interval of which contains one of its own.
 
         Beyond its ends the curve goes on, or ``stays`` where it begins and ends.
@@ -119,7 +119,7 @@ class Piecewise(NamedTuple):
 
     def insert_knots(self, times: Floats, apart: float = 0.0) -> Piecewise:
         """The same with further knots at times that lie inside, further ``apart`` [s] from any of its own."""
-        return self.refine(refine_knots(self.time, times, apart))
+        return self.with_knots(refine_knots(self.time, times, apart))
 
     def slice_pieces(self, first: int, last: int) -> Piecewise:
         """The pieces from a first one to before a last one."""
@@ -129,7 +129,7 @@ class Piecewise(NamedTuple):
     def between(self, start: float, end: float) -> Piecewise:
         """The part from a start to an end [s] within it."""
         inside = self.time[(self.time > start) & (self.time < end)]
-        return self.refine(np.concatenate([[start], inside, [end]]))
+        return self.with_knots(np.concatenate([[start], inside, [end]]))
 
     def start_from(self, state: Floats, fade: float) -> Piecewise:
         """The same from another state, derivatives (4, ...), at its first knot.
@@ -145,7 +145,7 @@ class Piecewise(NamedTuple):
         moved = self.insert_knots(extra.time)
         pieces = pad(moved.pieces, extra.pieces.shape[-1])
         early = moved.time[:-1] < extra.time[1]
-        pieces[early] += pad(extra.refine(moved.time).pieces[early], pieces.shape[-1])
+        pieces[early] += pad(extra.with_knots(moved.time).pieces[early], pieces.shape[-1])
         return Piecewise(moved.time, pieces)
 
     def stack(self, other: Piecewise) -> Piecewise:
@@ -215,7 +215,7 @@ def stack_ways(curves: Sequence[Piecewise], most: float = np.inf) -> Piecewise:
     # Coefficients of one power lie side by side in memory: arithmetic on long rows is fast.
     rows = np.zeros((powers, len(knots) - 1, len(curves), *inner))
     for i, curve in enumerate(curves):
-        pieces = curve.refine(knots, stays=True).pieces
+        pieces = curve.with_knots(knots, stays=True).pieces
         rows[: pieces.shape[-1], :, i] = np.moveaxis(pieces, -1, 0)
     return Piecewise(knots, np.moveaxis(rows, 0, -1))
 

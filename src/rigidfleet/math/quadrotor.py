@@ -65,7 +65,7 @@ def flat(force: Floats, yaw: Floats) -> Flat:
         along the heading's normal
     yaw : (K, 3): yaw [rad] and its derivatives
     """
-    z, thrust = _unit_vectors(force)
+    z, thrust = _unit_with_derivatives(force)
     psi, rate, second = yaw.T
     cos, sin, none = np.cos(psi), np.sin(psi), np.zeros(len(psi))
     heading = np.empty_like(force)
@@ -74,7 +74,7 @@ def flat(force: Floats, yaw: Floats) -> Flat:
     heading[:, 2] = np.stack(
         [-cos * rate**2 - sin * second, -sin * rate**2 + cos * second, none], axis=1
     )
-    y, _ = _unit_vectors(_cross_with_derivatives(z, heading))
+    y, _ = _unit_with_derivatives(_cross_with_derivatives(z, heading))
     x = _cross_with_derivatives(y, z)
 
     def dot_with_rate(a: Floats, b: Floats) -> tuple[Floats, Floats]:
@@ -89,7 +89,7 @@ def flat(force: Floats, yaw: Floats) -> Flat:
     return Flat(thrust, np.stack([x[:, 0], y[:, 0], z[:, 0]], axis=2), omega, omega_dot)
 
 
-def _unit_vectors(v: Floats) -> tuple[Floats, Floats]:
+def _unit_with_derivatives(v: Floats) -> tuple[Floats, Floats]:
     """Unit vectors of v (K, 3, 3), a vector and two derivatives, with theirs; and the length of v (K,)."""
     size = np.linalg.norm(v[:, 0], axis=1)
     u = np.empty_like(v)

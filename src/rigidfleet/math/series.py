@@ -94,7 +94,7 @@ def rotation_series(phi: Floats, orders: int | None = None) -> Floats:
     return R.transpose(0, *range(3, R.ndim), 1, 2)
 
 
-def rotation_vector_series(R: Floats) -> Floats:
+def rotation_vector_taylor(R: Floats) -> Floats:
     """Series (n, ..., 3) of rotation vectors phi [rad], R = Exp(phi), of rotations (n, ..., 3, 3); |phi| < pi.
 
     The inverse of `rotation_series`, order by order: coefficient k of R contains that of phi as R [J_r(phi) phi_k x],

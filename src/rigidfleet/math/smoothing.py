@@ -93,7 +93,7 @@ class Smoothed:
     def draw(self, count: int, random: np.random.Generator) -> Floats:
         """Control points (M + 4, 3, count) of ways as likely as the true one, given the samples."""
         normal = random.standard_normal((len(self.points), 3 * count))
-        return self.points[..., None] + _draw_normals(self.factor, normal).reshape(-1, 3, count)
+        return self.points[..., None] + _precision_draws(self.factor, normal).reshape(-1, 3, count)
 
 
 def b_spline_curve(knots: Floats, points: Floats) -> Piecewise:
@@ -192,7 +192,7 @@ def smooth(
     random = np.random.default_rng(0)
     for _ in range(turns):
         points, _, factor = solve_points(weight)
-        drawn = _draw_normals(factor, random.standard_normal((count, _DRAWN)))
+        drawn = _precision_draws(factor, random.standard_normal((count, _DRAWN)))
         size = (np.diff(about + points, 3, axis=0) ** 2).sum(axis=1)
         size = size / variance + 3.0 * (np.diff(drawn, 3, axis=0) ** 2).mean(axis=1)
         weight = (_FREEDOM + 3.0) / (_FREEDOM / weight.mean() + size)
@@ -205,7 +205,7 @@ def smooth(
     return Smoothed(knots, about + points, factor / sigma, calm, known, deviance, residual)
 
 
-def _draw_normals(factor: Floats, normal: Floats) -> Floats:
+def _precision_draws(factor: Floats, normal: Floats) -> Floats:
     """Normal numbers (C, ...) with the precision of a banded Cholesky factor."""
     from scipy.linalg import get_lapack_funcs
 

@@ -158,7 +158,7 @@ class Boundaries:
 
 def _distance_outside(region: Region, inclusion: bool, points: Floats, _: Ints) -> Measured:
     """How far curves (M, 6, P) are on the wrong side of a fence [m], see `Measure`."""
-    value, bound = region.depths_of_curves(points[:, :3], outside=inclusion)
+    value, bound = region.curve_depths_and_bounds(points[:, :3], outside=inclusion)
     return value, np.full(len(value), 0.5), bound
 
 

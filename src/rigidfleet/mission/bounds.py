@@ -81,7 +81,7 @@ _TOKENS = re.compile(
 _PARTS = re.compile(rf"{_BARE}|{_QUOTED}")
 
 
-def toml_excess_in_words(text: str) -> str:
+def toml_oversize_in_words(text: str) -> str:
     """Describe how TOML text exceeds the bounds; "" if it does not.
 
     One pass without recursion, before any parser sees the text: a parser would recurse into keys of any depth.

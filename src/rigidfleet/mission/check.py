@@ -73,13 +73,13 @@ def check_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
         (("constraint",), _gain_rules),
         (("lqr",), _regulator_rules),
         (("tracking",), _tracking_rules),
-        (("allocation",), _allocation_rules),
+        (("allocation",), _torque_allocation_rules),
         (("limits",), _limit_rules),
         (("yaw",), _yaw_rules),
         ((), _all_obstacle_rules),
         ((), _all_area_rules),
         (("formations",), formations.formation_rules),
-        ((), _touching_count_rules),
+        ((), _too_many_touching_rules),
         ((), phases.phase_rules),
         (("disturbances",), disturbances.disturbance_rules),
         (("network",), network.network_rules),
@@ -225,7 +225,7 @@ def _fixed_agent_rules(m: Draft) -> Breaches:
             yield Breach((), problem, remedy)
 
 
-def _touching_count_rules(m: Draft) -> Breaches:
+def _too_many_touching_rules(m: Draft) -> Breaches:
     """No radii so large that a list of all touching pairs would fill memory."""
     n = m.n
     if m.findings or n is None or n * (n - 1) // 2 <= bounds.TOUCHING:
@@ -310,7 +310,7 @@ def _tracking_rules(m: Draft) -> Breaches:
         yield from _bounded_gain_rules(m.tracking, (), "tracking")
 
 
-def _allocation_rules(m: Draft) -> Breaches:
+def _torque_allocation_rules(m: Draft) -> Breaches:
     """The torque is divided by the method that divides it."""
     if m.is_valid(("allocation",), "method"):
         yield from unused_key_rules(m.allocation, "torque_split", "method", "pinv")
@@ -327,7 +327,7 @@ def _limit_rules(m: Draft) -> Breaches:
     jerks = (q.name for q in MOTIONS if q.order == 3)
     # Of vehicles, the verdict judges the tilt.
     for key in jerks if m.flies_vehicles else (*jerks, "tilt_deg"):
-        if getattr(limits, key) is not None and not m.is_smooth:
+        if getattr(limits, key) is not None and not m.are_ways_smooth:
             problem = "has no effect: only the plan of a smooth mission keeps it"
             yield Breach(key, problem, "remove it or add smoothness = 'jerk' at the top")
 

@@ -210,7 +210,7 @@ def _read_trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) 
         curves = [least_jerk_curve(c.between(begin, end)) for c in curves]
     else:
         begin = min(c.time[0] for c in curves)
-        curves = [c.refine(np.union1d(begin, c.time), stays=True) for c in curves]
+        curves = [c.with_knots(np.union1d(begin, c.time), stays=True) for c in curves]
     if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
         why = next((note for note in read.notes if "yaw" in note), "has no yaw")
         raise text_error(name, why, "remove yaw = 'file', or give a file with a yaw and its unit")

@@ -46,7 +46,7 @@ def coincident_pairs(points: ArrayLike) -> list[tuple[int, int]]:
     return list(zip(first[first < own].tolist(), own[first < own].tolist(), strict=True))
 
 
-def most_edges(n: int) -> int:
+def edge_limit(n: int) -> int:
     """Maximum number of edges of a formation of n agents."""
     return max(bounds.EDGES, bounds.EDGES_EACH * n)
 
@@ -89,7 +89,7 @@ def _own_formation_rules(m: Draft, form: Formation, name: str) -> Breaches:
         return
     edges = n * (n - 1) // 2 if form.edges == "complete" else len(form.edges)
     # Edges between all pairs are only for few agents: their constraint law is solved densely.
-    most = bounds.EDGES if form.edges == "complete" else most_edges(n)
+    most = bounds.EDGES if form.edges == "complete" else edge_limit(n)
     if edges > most:
         problem = f"{n:,} agents have {edges:,} edges; the maximum is {most:,}"
         remedy = "use 'neighbours' or a list of pairs; a few more than 3 N - 6 edges hold a shape"
@@ -188,7 +188,7 @@ def _shape_rules(m: Draft, form: Formation, shape: str, n: int | None, path: Key
 def _edge_rules(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
     """Edges join different agents, each pair once."""
     if isinstance(form.edges, str):
-        yield from _graph_rules(m, form, n, path)
+        yield from _named_graph_rules(m, form, n, path)
         return
     seen: dict[tuple[int, ...], int] = {}
     for k, edge in enumerate(form.edges):
@@ -202,7 +202,7 @@ def _edge_rules(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
             yield Breach(("edges", k), f"repeats edge {first + 1}", "remove it and its distance")
 
 
-def _graph_rules(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
+def _named_graph_rules(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
     """A named graph can be derived from the slots; all except 'complete' are."""
     yield from unused_key_rules(form, "reach", "edges", "neighbours")
     if form.edges == "complete":
@@ -218,8 +218,8 @@ def _graph_rules(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
     assert slots is not None  # there are a shape or slots
     if form.edges == "neighbours":
         many = graphs.count_neighbour_edges(slots, form.reach)
-        if many > most_edges(n):
-            problem = f"joins {many:,} pairs of {n:,} agents; the maximum is {most_edges(n):,}"
+        if many > edge_limit(n):
+            problem = f"joins {many:,} pairs of {n:,} agents; the maximum is {edge_limit(n):,}"
             remedy = "reduce it; 1.9 includes second neighbours"
             yield Breach("reach", problem, remedy, form.reach)
         return

@@ -41,7 +41,7 @@ class Solid(Part):
         return None
 
     @property
-    def timed_path(self) -> tuple[Any, Any]:
+    def path_and_times(self) -> tuple[Any, Any]:
         """Displacements (W, 3) [m] and their times (W,) [s]; empty if the obstacle does not move."""
         return (), ()
 
@@ -59,7 +59,7 @@ class Solid(Part):
         ValueError
             The points of a hull lie in a plane.
         """
-        ways, times = self.timed_path
+        ways, times = self.path_and_times
         return records.one_solid(self.form, times, ways, self.lifetime)
 
 
@@ -80,7 +80,7 @@ class Moving(Solid):
     )
 
     @property
-    def timed_path(self) -> tuple[Any, Any]:
+    def path_and_times(self) -> tuple[Any, Any]:
         """Displacements (W, 3) [m] and their times (W,) [s]."""
         if self.velocity is not None and any(self.velocity):
             return np.outer([0.0, _EVER], self.velocity), np.array([0.0, _EVER])
@@ -117,7 +117,7 @@ class Box(Moving):
     @property
     def box_bounds(self) -> tuple[float, ...] | None:
         """Lowest and highest corner (6,) [m]; None if the box is turned or moves."""
-        if self.is_turned or len(self.timed_path[1]):
+        if self.is_turned or len(self.path_and_times[1]):
             return None
         return (*self.min, *self.max)
 
@@ -238,7 +238,7 @@ KINDS: dict[str, type[Part]] = models_by_kind(Obstacle)
 
 def is_ground(thing: Obstacle) -> bool:
     """Whether an obstacle counts as ground: a ground, and terrain and boxes that are no zones and at rest."""
-    firm = isinstance(thing, Heights | Box) and not thing.zone and not len(thing.timed_path[1])
+    firm = isinstance(thing, Heights | Box) and not thing.zone and not len(thing.path_and_times[1])
     return firm or isinstance(thing, Ground)
 
 

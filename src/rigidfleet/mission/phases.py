@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import toml_key
-from rigidfleet.foreign.curves import CHANNELS, greatest_jumps
+from rigidfleet.foreign.curves import CHANNELS, greatest_jumps_and_times
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import bounds
@@ -76,7 +76,7 @@ def _check_phases(m: Draft, phases: Written) -> None:
     for k, p in enumerate(phases):
         if p is not None:
             for rules in (
-                _arrival_rules(m, p),
+                _arrival_time_rules(m, p),
                 _smoothness_rules(m, p, k),
                 _automatic_time_rules(m, p, k),
             ):
@@ -358,7 +358,7 @@ def _follow_rules(m: Draft, p: Follow, k: int, longest: float | None) -> Breache
         yield Breach("trajectories", str(error), remedy, None)
         return
     for i in range(count):  # one that ends before the others stays where it ends
-        by, when = greatest_jumps(Piecewise(way.time, way.pieces[:, i]))
+        by, when = greatest_jumps_and_times(Piecewise(way.time, way.pieces[:, i]))
         for far, t, (most, unit) in zip(by.tolist(), when.tolist(), _JUMPS, strict=False):
             if far > most:
                 problem = f"jumps by {far:.3g} {unit} at {t:.6g} s"
@@ -498,7 +498,7 @@ def _smoothness_rules(m: Draft, p: Phase, k: int) -> Breaches:
     if not m.is_valid((), "smoothness"):
         return
     through = p.points
-    if not m.is_smooth:
+    if not m.are_ways_smooth:
         for key in [*p.auto_keys, *(["through"] if through else [])]:
             problem = "needs a smooth mission" + (" to have a least time" if key in TIMES else "")
             yield Breach(key, problem, "add smoothness = 'jerk' at the top of the mission")
@@ -531,7 +531,7 @@ def _smoothness_rules(m: Draft, p: Phase, k: int) -> Breaches:
 def _automatic_time_rules(m: Draft, p: Phase, k: int) -> Breaches:
     """Times that follow from the limits have limits to follow from."""
     keys = [key for key in p.auto_keys if m.is_valid(("phases", k), key)]
-    if not keys or not m.is_smooth:
+    if not keys or not m.are_ways_smooth:
         return
     if p.control != "tracking":
         problem = f"needs tracked slots to have a least time, not control '{p.control}'"
@@ -552,12 +552,12 @@ def _automatic_time_rules(m: Draft, p: Phase, k: int) -> Breaches:
         yield Breach(keys[0], problem, remedy)
 
 
-def _arrival_rules(m: Draft, p: Phase) -> Breaches:
+def _arrival_time_rules(m: Draft, p: Phase) -> Breaches:
     """A leg with a finite horizon has a time of arrival."""
     steering = p.steering
     if steering is None or steering.settle is None or steering.travel is not None:
         return
-    if m.is_smooth and p.control == "tracking":
+    if m.are_ways_smooth and p.control == "tracking":
         remedy = "give travel, or end by until or duration"
         yield Breach("settle", "a smooth way needs a time of arrival", remedy, None)
     elif m.is_valid((), "lqr"):

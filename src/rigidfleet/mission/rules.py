@@ -70,7 +70,7 @@ class Draft(FindingCollector):
         return isinstance(agents, dict) and "vehicle" in agents
 
     @property
-    def is_smooth(self) -> bool:
+    def are_ways_smooth(self) -> bool:
         """Whether acceleration and jerk of the references are to be continuous."""
         return self.smoothness == "jerk"
 

@@ -105,7 +105,7 @@ def parse_toml(text: str, origin: str) -> dict[str, Any]:
     MissionError
         The text is not valid TOML or exceeds the bounds on the text of a mission.
     """
-    if beyond := bounds.toml_excess_in_words(text):
+    if beyond := bounds.toml_oversize_in_words(text):
         raise text_error(origin, beyond, "reduce it; docs/missions.md lists the bounds")
     try:
         return tomllib.loads(text)

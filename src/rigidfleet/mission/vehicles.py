@@ -79,7 +79,7 @@ class VehicleModel(NamedTuple):
         return (across, across, along)
 
 
-def _model_parameters() -> dict[str, dict[str, tuple[Any, str]]]:
+def _parameters_and_sources() -> dict[str, dict[str, tuple[Any, str]]]:
     """The numbers of each model by key, each with its source."""
     tables = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
     for table in tables.values():
@@ -88,7 +88,7 @@ def _model_parameters() -> dict[str, dict[str, tuple[Any, str]]]:
     return tables
 
 
-MODELS = _model_parameters()
+MODELS = _parameters_and_sources()
 
 #: Keys that only a point has, and those of a quadrotor in their place.
 _OF_POINTS = {"thrust_limit": "thrust_coefficient", "drag": "rotor_drag"}

@@ -238,7 +238,7 @@ class Aborts:
     # -- the plan -----------------------------------------------------------------------------------------
 
     @property
-    def mission_end(self) -> float:
+    def plan_end(self) -> float:
         """When the plan ends [s]."""
         return self.legs[-1].end
 
@@ -308,7 +308,7 @@ class Aborts:
         fine = np.linspace(0.0, duration, 50 * len(time))
         time = refine_knots(time, np.interp(inside, clock.at(fine)[turn], fine[turn]), _NEAR)
         s = clock.states(time, 4)
-        ends = tuple(x[:, turn] for x in plan.refine(s[0, turn]).states_at_ends(4))[turn]
+        ends = tuple(x[:, turn] for x in plan.with_knots(s[0, turn]).piece_end_states(4))[turn]
         rates = s[1:, :-1], s[1:, 1:]
         return Piecewise.of_ends(time, *map(_states_by_clock, ends, rates))
 
@@ -351,9 +351,9 @@ class Aborts:
         time, over = self._least_time_along(
             first, self.limits, lambda time: _path_clock(begins, time, _SLOWING)
         )
-        if begins + 0.5 * time >= self.mission_end and self.mission_lands:
+        if begins + 0.5 * time >= self.plan_end and self.mission_lands:
             # What goes on beyond the end goes on down.
-            clock = _path_clock(begins, max(self.mission_end - begins, _LEAST), _ON)
+            clock = _path_clock(begins, max(self.plan_end - begins, _LEAST), _ON)
             return self.step_by_clock("to its end", clock), ""
         problem, step = "", self.step_by_clock("slow down", _path_clock(begins, time, _SLOWING))
         if over.max(initial=0.0) > _KEPT:
@@ -592,7 +592,7 @@ class Aborts:
 
     def all_aborts(self) -> Iterator[Abort]:
         """The abort of each `step` of the flight, on which vehicles act after its start and before its end."""
-        end = self.mission_end - self.options.reaction
+        end = self.plan_end - self.options.reaction
         for k in range(self.options.reaction == 0.0, math.ceil(end / self.options.step - 1e-9)):
             yield self.abort_at(k * self.options.step)
 
@@ -610,7 +610,7 @@ class Aborts:
             reason = f"only tracked slots can slow down, and '{phase.name}' tracks none"
             return Abort(ordered, begins, (), Home(reason=reason))
         step, problem = self.slow_down(begins)
-        if self.mission_lands and step.path is not None and step.path > self.mission_end - 1e-6:
+        if self.mission_lands and step.path is not None and step.path > self.plan_end - 1e-6:
             return Abort(ordered, begins, (step,), Home((), "lands as planned"))
         if problem := problem or self.obstruction_in_words(step, begins):
             return Abort(ordered, begins, (step,), Home(reason=problem))
@@ -625,12 +625,12 @@ class Aborts:
         alone = Aborts(self.mission, self.legs, stay | self.lost)
         alone.wrecked, alone.moves = self.wrecked, self.moves
         if self.mission_lands:
-            alone.start = self.plan.at(np.array([self.mission_end]))[0]
+            alone.start = self.plan.at(np.array([self.plan_end]))[0]
         return alone
 
     def _abort_of_leavers(self, ordered: float) -> Abort:
         """Some vehicles go home, as soon as they come near no other one; the others fly the plan on."""
-        begins, end = ordered + self.options.reaction, self.mission_end
+        begins, end = ordered + self.options.reaction, self.plan_end
         who = self._aborts_of_leavers.left
         order = np.concatenate([who, np.setdiff1d(self.left, who)])
         problem = "there is no time left"
@@ -656,7 +656,7 @@ class Aborts:
 
     def _all_ways(self, begins: float, waits: float, steps: Sequence[Step]) -> Piecewise:
         """The ways from a time on [s] of those that wait so long and then fly steps, and of the others, by the plan."""
-        last = np.array([max(begins, self.mission_end - _TOUCHING), self.mission_end])
+        last = np.array([max(begins, self.plan_end - _TOUCHING), self.plan_end])
         states = self.plan.states(last, 4)
         states[1:, 1] = 0.0  # a landing ends with the speed at which it touches down
         ways = [Piecewise.hermite(last, states).shift_time(-last[0])]
@@ -666,7 +666,7 @@ class Aborts:
         before = [on.between(0.0, waits)] if waits else []
         own = concatenate_curves([*before, *(step.way for step in steps)])
         knots, who = common_knots([own, on]), self._aborts_of_leavers.left
-        own, way = (x.refine(knots, stays=True) for x in (own, on))
+        own, way = (x.with_knots(knots, stays=True) for x in (own, on))
         way.pieces[:, who] = own.pieces[:, who]
         return way
 
@@ -681,7 +681,7 @@ class Aborts:
 
         left, (least, most, each) = self.left, _SAMPLED
         step = min(max(least, each * self.mission.n_agents), most)
-        time = np.arange(abort.begins, min(abort.rest_time, self.mission_end), step)
+        time = np.arange(abort.begins, min(abort.rest_time, self.plan_end), step)
         if len(left) < 2 or not len(time):
             return []
         on, others = self.plan.at(time)[:, left], abort.positions_at(time)[:, left]
@@ -764,7 +764,7 @@ def phases_of(mission: Mission, steps: Sequence[Step], before: str = "") -> list
     return phases
 
 
-def plan_exit_state(legs: Sequence[Leg], now: PhaseState) -> PhaseState:
+def abandonment_state(legs: Sequence[Leg], now: PhaseState) -> PhaseState:
     """The state from which all vehicles leave a plan, each with the motion that it is led on.
 
     The virtual body is their mean and no longer turns; no formation outlasts it.

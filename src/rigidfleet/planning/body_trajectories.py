@@ -85,7 +85,7 @@ def _lqr_curves(laws: Lqr, tracking: Tracking, length: float, rest: float) -> tu
 def stopping_motion(start: Pose, t0: float, arrival: float) -> Motion:
     """From a pose to rest with continuous acceleration and jerk, in one piece of degree 6; the pose decides where."""
     cm = np.stack([start.r, start.v, start.a, start.jerk])
-    begin = np.concatenate([cm, turn_to_start(start, start.T)], axis=1)
+    begin = np.concatenate([cm, pose_turn_from(start, start.T)], axis=1)
     piece = splines.stopping_piece(arrival - t0, begin)
     return as_motion(np.array([t0, arrival]), piece, start.T)
 
@@ -107,8 +107,8 @@ def smooth_motion(
     times = np.array([0.0, *(at.time or np.nan for at in through), total])
     if np.isnan(times).any():
         times = splines.least_snap_times(total, *meets)
-    phi = np.stack([turn_to_start(start, goal.T), np.stack([zero, goal.omega, zero, zero])], 1)
-    turn = Piecewise.hermite(times[[0, -1]], phi).refine(times).pieces
+    phi = np.stack([pose_turn_from(start, goal.T), np.stack([zero, goal.omega, zero, zero])], 1)
+    turn = Piecewise.hermite(times[[0, -1]], phi).with_knots(times).pieces
     cm = splines.minimum_snap(times, *meets)
     return as_motion(t0 + times, np.concatenate([cm, turn], axis=1), goal.T)
 
@@ -120,14 +120,14 @@ def points_passed(through: Sequence[Through], motion: Motion) -> tuple[dict[str,
     return tuple(at | {"time": t} for at, t in zip(points, times, strict=True))
 
 
-def turn_to_start(start: Pose, T1: Floats) -> Floats:
+def pose_turn_from(start: Pose, T1: Floats) -> Floats:
     """Rotation vector phi [rad] from an attitude T1 (3, 3) to that of a pose, and three derivatives (4, 3).
 
     Exp(phi) = T1 T^T, differentiated by the pose's body rates.
     """
     omega = series.series_by_derivatives(np.stack([start.omega, start.alpha, start.alpha_dot]))
     R = series.rotation_series_from_rates(start.T.T, omega)
-    return series.taylor_derivatives(series.rotation_vector_series(T1 @ R))
+    return series.taylor_derivatives(series.rotation_vector_taylor(T1 @ R))
 
 
 def orbit_motion(
@@ -186,7 +186,7 @@ def orbit_motion(
     lacking = carried[None]
     if smooth:
         cm = np.stack([start.v, start.a, start.jerk])
-        full = np.concatenate([cm, turn_to_start(start, attitude)[1:]], axis=1)
+        full = np.concatenate([cm, pose_turn_from(start, attitude)[1:]], axis=1)
         lacking = full - states(np.zeros(1), np.zeros((0, 6)))[1:, 0]
     length, fastest = t_end - t0, max(abs(first), abs(rate))
     run_in = min(blend, length)

@@ -113,7 +113,7 @@ def clearance_to(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: 
     (reference, motion), solid = planned.leg.slots_and_motion, thing.solid
     time, position = planned.time, planned.position
     if np.isfinite(solid.there).any():
-        time, position, speed = _path_while_present(planned, *solid.there[0].tolist(), speed)
+        time, position, speed = _path_and_speeds(planned, *solid.there[0].tolist(), speed)
     if not len(time):
         return Closest(np.inf, 0, float(planned.time[0]), np.inf)
     each, _ = proximity.obstacle_clearances(position, radius, [thing], time)
@@ -159,7 +159,7 @@ def clearance_to(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: 
     return Closest(best, agent, when, min(least, best - CLOSE))
 
 
-def _path_while_present(
+def _path_and_speeds(
     planned: PlannedPhase, since: float, until: float, speed: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Times (K,) of a phase from one time to another [s], positions (K, N, 3), and speeds (K - 1, N) between them."""

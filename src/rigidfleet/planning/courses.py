@@ -33,10 +33,10 @@ from rigidfleet.mission.schema import Lqr
 from rigidfleet.planning.body_trajectories import (
     as_motion,
     orbit_motion,
+    pose_turn_from,
     regulated_motion,
     smooth_motion,
     stopping_motion,
-    turn_to_start,
 )
 from rigidfleet.planning.reference import PhaseState, Pose, copy_with, pose_at
 from rigidfleet.typing import Floats
@@ -108,14 +108,14 @@ def _fly_course(mission: Mission, phase: Fly, now: PhaseState, t_end: float) -> 
 
 def _turn_course(mission: Mission, phase: Turn, now: PhaseState, t_end: float) -> Course:
     """Turn to an attitude on the spot."""
-    return _steer_course(mission, phase, now, t_end, now.pose_goal_slots[1].r, np.zeros(3))
+    return _steer_course(mission, phase, now, t_end, now.pose_goal_and_slots[1].r, np.zeros(3))
 
 
 def _steer_course(
     mission: Mission, phase: Steering, now: PhaseState, t_end: float, r: Floats, v: Floats
 ) -> Course:
     """Go to a place (3,) with a velocity there and an attitude, within ``travel`` or by the end."""
-    _, before, _ = now.pose_goal_slots
+    _, before, _ = now.pose_goal_and_slots
     arrival = t_end if phase.travel is None else now.t + seconds(phase.travel)
     angles = phase.attitude_deg
     T = before.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
@@ -126,7 +126,7 @@ def _steer_course(
 
 def _orbit_course(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Course:
     """Fly a circle, and continue with its velocity. An attitude that turns along is not an explicitly specified one."""
-    pose, goal, _ = now.pose_goal_slots
+    pose, goal, _ = now.pose_goal_and_slots
     motion = orbit_motion(phase, pose, goal.T, now.t, t_end, smooth=mission.smooth)
     named = goal.named and not phase.turns_away
     return Course(copy_with(pose_at(motion, t_end), named=named), t_end, lambda: motion)
@@ -134,7 +134,7 @@ def _orbit_course(mission: Mission, phase: Orbit, now: PhaseState, t_end: float)
 
 def _brake_course(mission: Mission, phase: Brake, now: PhaseState, t_end: float) -> Course:
     """Come to rest within ``travel`` or by the end, from the reference as it moves now."""
-    pose, before, _ = now.pose_goal_slots
+    pose, before, _ = now.pose_goal_and_slots
     arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
     motion = stopping_motion(pose, now.t, arrival)
     end = pose_at(motion, arrival)
@@ -150,7 +150,7 @@ def _vertical_course(mission: Mission, phase: Vertical, now: PhaseState, t_end: 
     Where each vehicle has a way of its own, the slots follow the same septic from rest to rest: together, each goes
     straight up or down by its own way, and one that stays, stays.
     """
-    pose, before, _ = now.pose_goal_slots
+    pose, before, _ = now.pose_goal_and_slots
     arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
     up, v, lift = np.zeros(3), np.zeros(3), None
     if phase.has_way_per_vehicle:
@@ -172,14 +172,14 @@ def _follow_course(mission: Mission, phase: Follow, now: PhaseState, t_end: floa
     What the first point of a file differs from the place where the vehicles are fades over `_FADED`; more, as avoidance
     may leave, over longer, so that its acceleration stays.
     """
-    pose, before, slots = now.pose_goal_slots
+    pose, before, slots = now.pose_goal_and_slots
     way = phase.pieces
     length = t_end - now.t if phase.travel is None else phase.travel
     scale = length / way.time[-1]
     knots, pieces = way.time * scale, way.pieces * scale ** -np.arange(float(way.pieces.shape[-1]))
     T1 = np.eye(3) if phase.turns_away else pose.T
     begin = np.concatenate(
-        [np.stack([pose.r, pose.v, pose.a, pose.jerk]), turn_to_start(pose, T1)], 1
+        [np.stack([pose.r, pose.v, pose.a, pose.jerk]), pose_turn_from(pose, T1)], 1
     )
     place = pose.r + (slots @ pose.T if pieces.shape[1] > 1 else 0.0)
     off = float(np.linalg.norm(pieces[0, :, :3, 0] - place, axis=1).max()) / _START_TOLERANCES[0]
@@ -271,7 +271,7 @@ def _trajectory_conflict_text(phase: Follow, now: PhaseState) -> str:
 
 def climb_distances(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     """How far [m] each vehicle (N,) goes up from the pose to hold: to a height, or (down) to just above the ground."""
-    (_, goal, slots), n = now.pose_goal_slots, mission.n_agents
+    (_, goal, slots), n = now.pose_goal_and_slots, mission.n_agents
     place, ground = goal.r[2] + slots @ goal.T[:, 2], _surface_heights_below(mission, now)
     if phase.arrival_height is None:
         up = np.minimum(ground + (ABOVE + mission.fleet.radius) - place, 0.0)
@@ -289,7 +289,7 @@ def _surface_heights_below(mission: Mission, now: PhaseState) -> Floats:
     MissionError
         There is nothing below a vehicle.
     """
-    _, goal, slots = now.pose_goal_slots
+    _, goal, slots = now.pose_goal_and_slots
     r = goal.r + slots @ goal.T
     heights = mission.height_below(*r.T)
     if len(off := np.flatnonzero(~now.lost & ~np.isfinite(heights))):
@@ -302,7 +302,7 @@ def _surface_heights_below(mission: Mission, now: PhaseState) -> Floats:
 
 def height_above_landing(mission: Mission, now: PhaseState) -> float:
     """How far [m] the lowest vehicle is above the height at which a landing ends, at the pose to hold."""
-    _, goal, slots = now.pose_goal_slots
+    _, goal, slots = now.pose_goal_and_slots
     below = goal.r[2] + slots @ goal.T[:, 2] - mission.fleet.radius
     return float(below[~now.lost].min() - _surface_heights_below(mission, now).min()) - ABOVE
 

@@ -218,7 +218,7 @@ def yaw_along(
         v = on_grid[1, :2, :, 0]
         from_body = yaw_by_kind(body, on_grid, Yaw())[0, :, 0]
         start = np.where(np.hypot(*v) > SLOW, np.arctan2(v[1], v[0]), from_body)
-    terms = np.ascontiguousarray(_yaw_rate_terms(on_grid)[0].transpose(2, 0, 1))  # (times, 3, N)
+    terms = np.ascontiguousarray(_yaw_ode_terms(on_grid)[0].transpose(2, 0, 1))  # (times, 3, N)
     between = terms[len(ends) :]
     grid = np.empty((len(ends), len(start)))
     grid[0] = start
@@ -235,14 +235,14 @@ def yaw_along(
         angles = Piecewise.hermite(ends, np.stack([grid, rates])).at(time)
     known = max(len(ends) - 3, 0)
     angles = angles.T
-    now, (A_dot, B_dot, C_dot) = _yaw_rate_terms(slots)
+    now, (A_dot, B_dot, C_dot) = _yaw_ode_terms(slots)
     cos, sin = np.cos(angles), np.sin(angles)
     first = _yaw_rate(angles, now)
     second = A_dot + B_dot * cos + C_dot * sin + first * (now[2] * cos - now[1] * sin)
     return np.stack([angles, first, second]), (float(ends[known]), grid[known])
 
 
-def _yaw_rate_terms(slots: Floats) -> tuple[Floats, Floats]:
+def _yaw_ode_terms(slots: Floats) -> tuple[Floats, Floats]:
     """Terms A, B, C (3, N, K) of yaw' = A + B cos yaw + C sin yaw of kind "along", and their rates, from `slot_taylor`.
 
     |v| - h . v becomes (|v|^2 - |v| h . v) / sqrt(|v|^2 + SLOW^2), which is smooth at rest.
@@ -267,5 +267,5 @@ def _yaw_rate_terms(slots: Floats) -> tuple[Floats, Floats]:
 
 
 def _yaw_rate(yaw: Floats, terms: Floats) -> Floats:
-    """Rate of yaw "along" [rad/s] at yaws (...) from the `_yaw_rate_terms` terms (3, ...)."""
+    """Rate of yaw "along" [rad/s] at yaws (...) from the `_yaw_ode_terms` terms (3, ...)."""
     return terms[0] + terms[1] * np.cos(yaw) + terms[2] * np.sin(yaw)

@@ -100,7 +100,7 @@ def narrow_yaws(slots: Floats, start: Angles, axes: list[Floats]) -> set[float]:
     return yaws
 
 
-def layer_changes(
+def changes_between_layers(
     mission: Mission, shapes: Sequence[CandidateShape], angles: Sequence[Angles]
 ) -> Iterator[Change]:
     """Turns and changes of shape, each between two layers; layers are all angles of the first shape, and so on."""
@@ -108,14 +108,14 @@ def layer_changes(
     for s, shape in enumerate(shapes):
         for (i, a), (j, b) in combinations(enumerate(angles), 2):
             if angle_between_attitudes(a, b) < _HALF:
-                yield Change(s * count + i, s * count + j, *_turn_path(shape.slots, a, b))
+                yield Change(s * count + i, s * count + j, *_turn_path_and_ways(shape.slots, a, b))
     for (s, one), (t, two) in combinations(enumerate(shapes), 2):
         for i, a in enumerate(angles):
             if (folding := _shape_change_path(mission, one, two, a)) is not None:
                 yield Change(s * count + i, t * count + i, *folding)
 
 
-def _turn_path(slots: Floats, before: Angles, after: Angles) -> tuple[Path, Floats]:
+def _turn_path_and_ways(slots: Floats, before: Angles, after: Angles) -> tuple[Path, Floats]:
     """Offsets of slots that turn on the spot from one attitude to another, and their ways (N,) [m]."""
     A, B = (att.dcm_from_euler(np.deg2rad(x)) for x in (before, after))
     phi = att.rotation_vector_from_dcm(A @ B.T)

@@ -145,7 +145,7 @@ class Leg:
         """Time [s] at which the phase is expected to end: one that ends by settling, soon after it reaches its goal."""
         if self.phase.settle is None:
             return self.t_end
-        return self.start + settling_duration(self.phase, self.constraint, self._time_to_goal())
+        return self.start + settle_phase_duration(self.phase, self.constraint, self._time_to_goal())
 
     def _time_to_goal(self) -> float:
         """Time [s] from the start from which on the body is planned to be as near its goal as the phase asks for."""
@@ -326,7 +326,7 @@ def latest_end(phase: Phase, start: float) -> float:
     return start + seconds(phase.duration or (phase.settle or Settle()).timeout)
 
 
-def settling_duration(phase: Phase, constraint: Constraint, reached: float = 0.0) -> float:
+def settle_phase_duration(phase: Phase, constraint: Constraint, reached: float = 0.0) -> float:
     """Expected duration [s] of a phase that ends by settling: soon after its motion.
 
     Errors of distances have to settle; the goal is ``reached`` so long after the start [s].
@@ -343,6 +343,6 @@ def phase_spans(mission: Mission) -> list[tuple[float, float]]:
     for phase in mission.phases:
         begin, end = end, latest_end(phase, end)
         if phase.settle is not None:
-            end = begin + settling_duration(phase, mission.constraint)
+            end = begin + settle_phase_duration(phase, mission.constraint)
         spans.append((begin, end))
     return spans

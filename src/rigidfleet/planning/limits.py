@@ -77,14 +77,14 @@ def limits_of(
         air = 0.0 if reserve is None else airflow_force(mission, -x[:, 1], who) / mass[who, None]
         return x[:, 2] + up - air
 
-    def tilt(_: Quantity, x: Floats, who: Ints) -> Floats:
+    def tilt_with_overshoot(_: Quantity, x: Floats, who: Ints) -> Floats:
         f, off = force_per_mass(x, who), lag_overshoot(2, x, who)
         return np.rad2deg(np.arctan2(SIZES["horizontal"](f) + off, f[..., 2] - off))
 
-    def thrust(_: Quantity, x: Floats, who: Ints) -> Floats:
+    def thrust_with_overshoot(_: Quantity, x: Floats, who: Ints) -> Floats:
         return mass[who] * (SIZES[""](force_per_mass(x, who)) + lag_overshoot(2, x, who))
 
-    ways, finite = {"tilt": tilt, "thrust": thrust}, []
+    ways, finite = {"tilt": tilt_with_overshoot, "thrust": thrust_with_overshoot}, []
     for q in (*MOTIONS, QUANTITIES["tilt"], QUANTITIES["thrust"]):
         table, _, key = q.key.partition(".")
         most = mission.fleet.thrust_limit if table == "agents" else getattr(limits, key)

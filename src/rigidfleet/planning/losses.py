@@ -22,16 +22,16 @@ from rigidfleet.planning.abort import (
     JERK,
     SHORTEST,
     Aborts,
+    abandonment_state,
     capped_limits,
     phases_of,
-    plan_exit_state,
     shortest_time,
 )
 from rigidfleet.planning.clearance import CLOSE, clearance_to, speed_bounds
 from rigidfleet.planning.courses import climb_distances, height_above_landing
 from rigidfleet.planning.legs import Leg, depart, leg_from, leg_of, phase_spans
 from rigidfleet.planning.limits import use_of_limits
-from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase
+from rigidfleet.planning.preview import FEWEST_SAMPLES, sample_leg
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.timing import timed_leg
 from rigidfleet.typing import Floats
@@ -86,7 +86,7 @@ def answer_to_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequenc
     phases, least = phases_of(mission, abort.steps, "abort: "), abort.certificate.separation
     promise = least if abort.home.way and math.isfinite(least) else None
     return Answer(
-        legs_from(mission, plan_exit_state(legs, now), phases), abort.home.reason, promise
+        legs_from(mission, abandonment_state(legs, now), phases), abort.home.reason, promise
     )
 
 
@@ -114,7 +114,7 @@ def loss_legs(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg
         whole = plan()
         slow, *_ = Aborts(mission, whole, start.lost).slow_down(start.t)
         brake = phases_of(mission, [slow._replace(name="brake (loss)")])
-        legs = legs_from(mission, plan_exit_state(whole, start), brake)
+        legs = legs_from(mission, abandonment_state(whole, start), brake)
         now = legs[-1].planned_end_state
     if d.on_loss == "hold":
         until = phase_spans(mission)[-1][1] if d.hold_until is None else d.hold_until
@@ -151,7 +151,7 @@ def loss_legs(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg
 
 def _hits_obstacle(mission: Mission, leg: Leg) -> bool:
     """Whether a leg leads a slot into an obstacle or the ground."""
-    planned = planned_phase(leg, FEWEST_SAMPLES)
+    planned = sample_leg(leg, FEWEST_SAMPLES)
     near = (clearance_to(planned, x, leg.radius, speed_bounds(planned)) for x in mission.obstacles)
     return any(x.clearance < -CLOSE for x in near)
 

@@ -94,7 +94,7 @@ class PhasePlan(Leg):
         # Beyond, it takes longer than their flight.
         return super().certificate if len(self.radius) <= bounds.ALL_PAIRS else None
 
-    def postpone_events(self, postponed_time: Callable[[float], float]) -> None:
+    def postpone_arrival(self, postponed_time: Callable[[float], float]) -> None:
         """Move its end, the arrival and the points on its way to other times [s]."""
         self.t_end, self.arrival = postponed_time(self.t_end), postponed_time(self.arrival)
         self.through = tuple(at | {"time": postponed_time(at["time"])} for at in self.through)
@@ -176,7 +176,7 @@ class PhasePlan(Leg):
             self.integrator, self.before.r, self.masses, beta, large=self.is_large
         )
 
-    def residual_tolerances(self) -> tuple[float, float]:
+    def solver_rtol_and_atol(self) -> tuple[float, float]:
         """Relative and absolute [m/s^2] residual of an iterative solve for the multipliers."""
         share = min(max(_RESIDUAL * self.integrator.rtol, _LEAST_RESIDUAL), _MOST_RESIDUAL)
         return share, _FLOOR * float(self.velocity_tolerance().min())  # over a step of 1 s
@@ -397,7 +397,7 @@ def _feedback(mission: Mission, phase: Phase, goal: Pose, t0: float, arrival: fl
         horizon = arrival - t0
         to_go = np.concatenate([[0.0], np.geomspace(min(1e-6, 1e-3 * horizon), horizon, 1000)])
         laws = regulators(mission, phase)
-        tables = [_regulator_gains(law, to_go) for law in (laws, laws.attitude)]
+        tables = [_gains_and_slopes(law, to_go) for law in (laws, laws.attitude)]
         gain, slope = (np.concatenate(columns, axis=1) for columns in zip(*tables, strict=True))
     return Feedback(
         to_go, np.ascontiguousarray(gain), np.ascontiguousarray(slope), arrival, goal.r, goal.v,
@@ -405,7 +405,7 @@ def _feedback(mission: Mission, phase: Phase, goal: Pose, t0: float, arrival: fl
     )  # fmt: skip
 
 
-def _regulator_gains(law: Regulator, to_go: Floats) -> tuple[Floats, Floats]:
+def _gains_and_slopes(law: Regulator, to_go: Floats) -> tuple[Floats, Floats]:
     """Gains (K, 2) of one axis over the time to go (K,) [s], and their slopes (Riccati equation)."""
     if law.horizon == "infinite":
         gain = np.tile(lqr.double_integrator_gains(law.Q, law.R), (len(to_go), 1))

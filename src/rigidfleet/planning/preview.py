@@ -67,11 +67,11 @@ def preview_phases(mission: Mission, phases: int | None = None) -> tuple[list[Pl
         if not leg.has_known_ways:
             return planned, False
         now = leg.planned_end_state
-        planned.append(planned_phase(leg, most))
+        planned.append(sample_leg(leg, most))
     return planned, len(planned) == len(wanted)
 
 
-def planned_phase(leg: Leg, most: int) -> PlannedPhase:
+def sample_leg(leg: Leg, most: int) -> PlannedPhase:
     """At most ``most`` samples of a leg."""
     reference, motion = leg.slots_and_motion
     count = min(max(_SAMPLES, int((leg.end - leg.start) / _STEP) + 1), _MOST, most)

@@ -124,7 +124,7 @@ class PhaseState:
         self.lost = np.zeros(len(self.r), dtype=np.bool_)
 
     @property
-    def pose_goal_slots(self) -> tuple[Pose, Pose, Floats]:
+    def pose_goal_and_slots(self) -> tuple[Pose, Pose, Floats]:
         """Pose, goal and slots of a state with the frame attached: no phase that moves, or tracks slots, lacks them."""
         assert self.pose is not None
         assert self.goal is not None

@@ -117,7 +117,7 @@ def plan_transfer(
         for start_number in range(_STARTS + 2):
             control = (1 - _SHARE) * s + _SHARE * g  # straight ways
             if start_number > _STARTS:  # as in a roundabout, for crowds that all meet at one place
-                control = _descend(_keep_right_control_points(s, g), duration, limits, rng)
+                control = _descend(_half_ellipse_control_points(s, g), duration, limits, rng)
             elif start_number:  # straight ways will not do
                 control = _descend(control, duration, limits, rng)
             if not _keeps_limits(control, duration, limits):
@@ -149,7 +149,7 @@ def _b_spline_weights(u: Floats, spans: int) -> Floats:
     return B
 
 
-def _keep_right_control_points(s: Floats, g: Floats) -> Floats:
+def _half_ellipse_control_points(s: Floats, g: Floats) -> Floats:
     """Control points (M + 3, N, 3) of ways that all keep to the right, seen from above on half an ellipse.
 
     Where each vehicle goes to the opposite place of a circle, this is half a turn of them all.

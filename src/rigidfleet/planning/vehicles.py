@@ -17,7 +17,7 @@ from rigidfleet.kernel.clock_records import FASTEST, OFF, RATE, VehicleClocks, s
 from rigidfleet.kernel.mail import Links, no_network
 from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
 from rigidfleet.math import series
-from rigidfleet.math.margins import Lag, LoopGains, reference_error_gain
+from rigidfleet.math.margins import Lag, LoopGains, tracking_lag_time
 from rigidfleet.math.quadrotor import ROTORS
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import VehicleModel
@@ -92,7 +92,7 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
     )  # fmt: skip
 
 
-def vehicle_lags(mission: Mission) -> list[Lag]:
+def lags_by_vehicle(mission: Mission) -> list[Lag]:
     """Lag and delay of each vehicle; empty for points that give any force at once."""
     models = mission.vehicle_models
     if models is None:
@@ -113,19 +113,19 @@ def vehicle_lags(mission: Mission) -> list[Lag]:
 
 
 def tracking_lag_times(mission: Mission) -> Floats:
-    """Times T (N,) [s] by which a vehicle leaves its reference at most (`margins.reference_error_gain`); 0 for points.
+    """Times T (N,) [s] by which a vehicle leaves its reference at most (`margins.tracking_lag_time`); 0 for points.
 
     Its acceleration differs by up to T times the reference's greatest jerk, its velocity by up to T times the greatest
     acceleration.
     """
     times = np.zeros(mission.n_agents)
-    c, tracking, lags = mission.constraint, mission.tracking, vehicle_lags(mission)
+    c, tracking, lags = mission.constraint, mission.tracking, lags_by_vehicle(mission)
     law = LoopGains(c.alpha, c.beta, c.gamma, *mission.tracking_gains, tracking.integral)
     for i, model in enumerate(mission.vehicle_models or ()):
         if not model.point:
             left = _LEFT * max(model.linear_drag)
             drag = left if tracking.drag_feedforward else model.linear_drag[0]
-            times[i] = reference_error_gain(lags[i], law, drag / model.mass)
+            times[i] = tracking_lag_time(lags[i], law, drag / model.mass)
     return times
 
 
@@ -143,7 +143,7 @@ def airflow_force(mission: Mission, u: Floats, who: Ints | slice = slice(None)) 
     return force
 
 
-def jet_speeds(mission: Mission, r: Floats) -> Floats:
+def pair_jet_speeds(mission: Mission, r: Floats) -> Floats:
     """Speed [m/s] of the air downwards at each vehicle due to each other one above, (K, N, N) at r (K, N, 3) [m]."""
     below = r[:, None] - r[:, :, None]
     flow, s, beside = np.zeros(below.shape[:3]), below[..., 2], (below[..., :2] ** 2).sum(axis=-1)
@@ -340,7 +340,7 @@ class TickTables:
             # An ideal point has no attitude that goes ahead of its force.
             yaw, slots = self._yaw_slots(problem, ticks / self.rate, turn)
             if len(slots):
-                jerk, snap = self._desired_force_rates(slots)
+                jerk, snap = self._desired_jerk_and_snap(slots)
         if self.compensated:
             path = _tick_rows(slots[:2].reshape(6, self.n, -1)) if len(slots) else self._path(ticks)
         noise_r = noise_v = np.zeros((0, self.n, 3))
@@ -386,14 +386,14 @@ class TickTables:
         if self._known is not None and self._known[0] is turn and self._known[1] < time[0]:
             since, start = self._known[1], self._known[2][None]
         whole = np.concatenate([[since], time])
-        slots, turned, known = slots_and_yaw(
+        slots, turned, known = slot_taylor_and_yaw(
             reference, motion, whole, self.yaw, turn._replace(start=start)
         )
         if known is not None:
             self._known = turn, *known
         return _tick_rows(turned[..., 1:]), series.taylor_derivatives(slots[..., 1:])
 
-    def _desired_force_rates(self, x: Floats) -> tuple[Floats, Floats]:
+    def _desired_jerk_and_snap(self, x: Floats) -> tuple[Floats, Floats]:
         """Two derivatives (K, N, 3) of the desired force per mass, from those of the reference, (5, 3, N, K).
 
         Drag that is fed forward changes the force with the velocity; near level flight body axes are the world's.
@@ -455,7 +455,7 @@ def yaw_turn(reference: Reference, motion: Motion, t: float, yaw: Yaw, start: Fl
     return YawTurn(t, start, off)
 
 
-def slots_and_yaw(
+def slot_taylor_and_yaw(
     reference: Reference, motion: Motion, time: Floats, yaw: Yaw, turn: YawTurn
 ) -> tuple[Floats, Floats, tuple[float, Floats] | None]:
     """Series of the slots (5, 3, N, K), and the yaw with two derivatives (3, N, K) that is asked of the vehicles.

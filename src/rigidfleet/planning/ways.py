@@ -26,7 +26,7 @@ from rigidfleet.planning import layers
 from rigidfleet.planning.clearance import clearance_to, speed_bounds
 from rigidfleet.planning.lattice import FreeSpace, Layer, Roadmap, Way, constant_path
 from rigidfleet.planning.legs import Leg, latest_end, state_at_start
-from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
+from rigidfleet.planning.preview import FEWEST_SAMPLES, sample_leg, samples_per_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.solids.records import box_corners, swept_extent
 from rigidfleet.typing import Floats
@@ -130,7 +130,7 @@ class _Search:
         need = self.phase.clearance + _KEPT
         for _ in range(_TRIES):
             way = self._cheapest_way(need)
-            mission, lacking = self._try_way(*way)
+            mission, lacking = self._mission_and_shortfall(*way)
             if lacking <= 0.0:
                 return mission
             need += lacking + _KEPT
@@ -191,7 +191,7 @@ class _Search:
             count = np.clip(np.ceil((high - low) / (2.0 * self.reach)), *_EVEN).astype(int)
             even = map(np.linspace, low, high, count)
             common.append([np.unique([*a, *b]) for a, b in zip(even, ends.T, strict=True)])
-        changes = list(layers.layer_changes(self.mission, shapes, angles))
+        changes = list(layers.changes_between_layers(self.mission, shapes, angles))
         if not self.each:  # the one ball that covers all neither turns nor changes
             stays = constant_path(nodes[0])
             changes = [c._replace(path=stays, ways=np.zeros(1)) for c in changes]
@@ -256,7 +256,7 @@ class _Search:
                 del last["duration"]
         return tables
 
-    def _try_way(self, roadmap: Roadmap, way: Way) -> tuple[Mission, float]:
+    def _mission_and_shortfall(self, roadmap: Roadmap, way: Way) -> tuple[Mission, float]:
         """The mission with a way, and the clearance [m] that its proof lacks: that of every vehicle, in time."""
         mission, k = self.mission, self.number
         data, tables = mission.to_dict(), self._phase_tables(roadmap, way)
@@ -283,7 +283,7 @@ class _Search:
 
     def _missing_clearance(self, mission: Mission, leg: Leg) -> float:
         """How much [m] the clearance of a planned leg is below what is asked for; negative if it is kept."""
-        planned = planned_phase(leg, max(samples_per_phase(mission), FEWEST_SAMPLES))
+        planned = sample_leg(leg, max(samples_per_phase(mission), FEWEST_SAMPLES))
         speed, need, radius = speed_bounds(planned), self.phase.clearance, mission.fleet.radius
         least = math.inf
         for thing in mission.obstacles:

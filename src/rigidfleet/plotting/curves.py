@@ -41,7 +41,7 @@ class EdgeGroup:
     label: str
 
 
-def edge_groups(result: Result) -> list[EdgeGroup]:
+def edges_by_length(result: Result) -> list[EdgeGroup]:
     """Edges grouped by their intended lengths in all formations, short ones dark, long ones light.
 
     If there are few edges, each is a group of its own.
@@ -92,7 +92,7 @@ def _edge_label(result: Result, edges: list[int], lengths: Floats) -> str:
 
 def draw_edge_lines(ax: Axes, result: Result, values: Floats, **look: Any) -> None:
     """A line for each edge, values (K, m), in the colour of its group; for many edges, the spread of each group."""
-    for group in edge_groups(result):
+    for group in edges_by_length(result):
         of_group = values[:, group.edges]
         if len(result.edges) > st.MANY:
             of_group = np.where(np.isfinite(result.constraint[:, group.edges]), of_group, np.nan)
@@ -104,7 +104,7 @@ def draw_edge_lines(ax: Axes, result: Result, values: Floats, **look: Any) -> No
 
 def edge_handles(result: Result) -> list[Line2D]:
     """Legend entries of the groups of edges."""
-    groups = edge_groups(result)
+    groups = edges_by_length(result)
     chosen = [groups[i] for i in st.spaced_indices(len(groups), 9)]
     return [st.legend_entry(g.label, color=g.colour) for g in chosen]
 
@@ -332,7 +332,7 @@ def disturbance(result: Result) -> Figure:
 # -- errors ------------------------------------------------------------------------------------------
 
 
-def shape_error(result: Result) -> Floats:
+def greatest_pair_error(result: Result) -> Floats:
     """Greatest error (K,) [m] of all pairs' distances against the slots of the phase's formation.
 
     NaN if the formation has no slots; with many agents, also NaN at most samples.
@@ -358,7 +358,7 @@ def shape_error(result: Result) -> Floats:
 def draw_constraint_error(ax: Axes, result: Result) -> list[Line2D]:
     """Draw the errors |c| of the edges, the greatest, and that of all pairs; return legend entries of the last two."""
     ax.set_ylabel("error |c| of an edge [m]" if has_edges(result) else "error of all pairs [m]")
-    size, shape = np.abs(result.constraint), shape_error(result)
+    size, shape = np.abs(result.constraint), greatest_pair_error(result)
     handles = []
     if np.isfinite(shape).any():
         look: dict[str, Any] = {"color": st.FLOWN, "linewidth": 2.0, "zorder": 1.9}

@@ -39,7 +39,7 @@ def slots_or_layout(mission: Mission, name: str) -> tuple[Floats, bool]:
     d = shortest_path(coo_array((lengths, edges.T), (n, n)), directed=False)
     # Between components that no edge joins
     d[np.isinf(d)] = 1.5 * d[np.isfinite(d)].max(initial=1.0)
-    value, vector = distance_geometry.classical_scaling(d)
+    value, vector = distance_geometry.gram_eigensystem(d)
     places = np.zeros((n, 3))
     places[:, : min(n, 3)] = (vector * np.sqrt(np.maximum(value, 0)))[:, ::-1][:, :3]
     return places, False
@@ -78,7 +78,7 @@ def _draw_formation(ax: Axes, result: Result, name: str) -> None:
     """Draw a formation with the colours of its edges in all figures, and its body axes."""
     mission, edges = result.mission, result.mission.formation_edges(name).tolist()
     formation, colours = mission.formations[name], {}
-    for group in curves.edge_groups(result):
+    for group in curves.edges_by_length(result):
         colours |= {tuple(result.edges[k].tolist()): group.colour for k in group.edges}
     words = formation.shape or ("slots" if formation.slots is not None else "by distances")
     words += f", {len(edges)} edge{'s' if len(edges) != 1 else ''}" * bool(edges)

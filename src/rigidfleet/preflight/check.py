@@ -15,13 +15,13 @@ from rigidfleet.mission import Mission, as_mission
 from rigidfleet.mission.files import notes_on_files
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview_phases, samples_per_phase
 from rigidfleet.planning.timing import complete_times
-from rigidfleet.planning.vehicles import tracking_lag_times, vehicle_lags
+from rigidfleet.planning.vehicles import lags_by_vehicle, tracking_lag_times
 from rigidfleet.preflight import trajectory
 from rigidfleet.preflight.assignment import assignment_remarks
 from rigidfleet.preflight.avoidance import braking_remarks
 from rigidfleet.preflight.findings import Preflight, Remark
 from rigidfleet.preflight.formations import SEARCHED, check_formations, formation_remarks
-from rigidfleet.preflight.gains import check_gains, gain_remarks
+from rigidfleet.preflight.gains import check_pid_gains, gain_remarks
 from rigidfleet.preflight.losses import loss_remarks
 from rigidfleet.preflight.margins import check_margins, margin_remarks
 from rigidfleet.preflight.network import check_network, network_remarks
@@ -57,11 +57,11 @@ def check(
     formations = check_formations(mission, search=search, progress=progress)
     progress("planned paths")
     planned, known = preview_phases(mission)
-    preflight = Preflight(mission, formations, check_gains(mission, formations), planned)
+    preflight = Preflight(mission, formations, check_pid_gains(mission, formations), planned)
     trajectory.find_greatest(mission, preflight)
     if not known:
         preflight.judged_to = float(planned[-1].time[-1]) if planned else 0.0
-    if lags := vehicle_lags(mission):
+    if lags := lags_by_vehicle(mission):
         progress("margins")
         preflight.margins = check_margins(mission, planned, lags)
         preflight.network = check_network(mission, planned, lags)
@@ -85,7 +85,7 @@ def check(
         *obstacle_remarks(mission, preflight),
         *boundary_remarks(mission, preflight),
         *trajectory.limit_remarks(mission, preflight),
-        *trajectory.waypoint_remarks(mission, preflight),
+        *trajectory.waypoint_miss_remarks(mission, preflight),
         *loss_remarks(mission, preflight),
     ]
     if planned and (words := mission.landing_swaps_in_words(planned[-1].position[-1])):

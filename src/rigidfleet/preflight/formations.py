@@ -55,7 +55,7 @@ def check_formations(
     mission: Mission, *, search: bool, progress: Callable[[str], None]
 ) -> list[FormationCheck]:
     """Check all formations and return them in their order. Those that are flown have priority if work is limited."""
-    held = {name: _holding_control(mission, name) for name in mission.formations}
+    held = {name: _formation_control(mission, name) for name in mission.formations}
     left, checks = _FORMING, {}
     for k, name in enumerate(sorted(held, key=lambda name: held[name] == "nothing"), start=1):
         progress(f"formation '{name}', {k} of {len(held)}")
@@ -109,7 +109,7 @@ def _check_formation(
     return replace(check, realisations=others)
 
 
-def _holding_control(mission: Mission, name: str) -> _Held:
+def _formation_control(mission: Mission, name: str) -> _Held:
     """What holds a formation in the phases that have it."""
     now, controls = None, set()
     for phase in mission.phases:
@@ -151,7 +151,7 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         if f.rigidity is not None and f.held_by == "distances"
         and (f.rigidity.rigidity_class is RigidityClass.FLEXIBLE or f.rigidity.space < 3)
     }  # fmt: skip
-    forecasts = _flexibility_forecasts(mission, soft)
+    forecasts = _dimension_error_forecasts(mission, soft)
     for f in formations:
         if f.held_by == "nothing":
             continue
@@ -188,7 +188,7 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
                 f"solver 'exact' has no solution at '{f.name}': only {r.rank} of its {len(r.edges)} distances are"
                 " independent. Use solver = 'iterated'"
             )
-        yield from _other_shape_remarks(mission, f, alone=alone)
+        yield from _realisation_remarks(mission, f, alone=alone)
 
 
 def _dimension_spanned(points: Floats, *moves: Floats) -> int:
@@ -227,7 +227,7 @@ def _flat_start_remarks(mission: Mission) -> Iterator[Remark]:
         return
 
 
-def _flexibility_forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]:
+def _dimension_error_forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]:
     """What becomes of some formations that distances alone hold, if only forces along their edges move the agents.
 
     By name: the greatest dimension of the space that the agents keep to, and the greatest error of a pair at the end of
@@ -281,7 +281,7 @@ def _flex_remarks(name: str, r: Rigidity, forecast: tuple[int, float] | None) ->
     yield Remark(level, "formation", text + held)
 
 
-def _other_shape_remarks(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterator[Remark]:
+def _realisation_remarks(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterator[Remark]:
     """Remarks on other shapes with the same distances, if distances alone guide the agents."""
     others = f.realisations
     if others is None or not alone:

@@ -13,7 +13,7 @@ from rigidfleet.planning.legs import phase_spans
 from rigidfleet.preflight.findings import FormationCheck, GainsCheck, Preflight, Remark
 
 
-def check_gains(mission: Mission, formations: list[FormationCheck]) -> GainsCheck:
+def check_pid_gains(mission: Mission, formations: list[FormationCheck]) -> GainsCheck:
     """Stability, settling time and overshoot of the constraint law, and its force per error of a distance."""
     c = mission.constraint
     stabilised, settling = c.stabilisation == "pid", c.settling_time

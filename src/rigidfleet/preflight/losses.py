@@ -14,7 +14,7 @@ from rigidfleet.planning.losses import Answer, answer_to_loss
 from rigidfleet.planning.preview import (
     FEWEST_SAMPLES,
     PlannedPhase,
-    planned_phase,
+    sample_leg,
     samples_per_phase,
 )
 from rigidfleet.planning.reference import copy_with
@@ -26,7 +26,7 @@ from rigidfleet.rigidity import analyse
 
 def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on lost links, and on the way of those left after the first loss."""
-    yield from _lost_link_remarks(mission)
+    yield from _lost_edge_remarks(mission)
     first = mission.abandons_at
     if not np.isfinite(first):
         return
@@ -53,16 +53,16 @@ def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     yield Remark("note", "loss", text)
     most = max(samples_per_phase(mission), FEWEST_SAMPLES)
     part = Preflight(
-        mission, preflight.formations, preflight.gains, [planned_phase(x, most) for x in way]
+        mission, preflight.formations, preflight.gains, [sample_leg(x, most) for x in way]
     )
     for judge in (
         separation_remarks, downwash_remarks, obstacle_remarks, boundary_remarks, limit_remarks,
     ):  # fmt: skip
         yield from judge(mission, part)
-    yield from _hit_remarks(Aborts(mission, legs, mission.lost_at <= first), part.planned_phases)
+    yield from _wreck_remarks(Aborts(mission, legs, mission.lost_at <= first), part.planned_phases)
 
 
-def _hit_remarks(aborts: Aborts, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
+def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
     """Remarks on those left who hit a lost vehicle that falls or lies, at samples of the way after the loss."""
     left, radius = aborts.left, aborts.radius[aborts.left] - aborts.fall_uncertainty.max()
     for planned in way if aborts.wrecks else ():
@@ -83,7 +83,7 @@ def planned_answer_to_loss(mission: Mission, at: Leg, legs: Sequence[Leg]) -> An
     return answer_to_loss(mission, now, lambda: legs)
 
 
-def _lost_link_remarks(mission: Mission) -> Iterator[Remark]:
+def _lost_edge_remarks(mission: Mission) -> Iterator[Remark]:
     """Remarks on the rigidity of each formation without the edges of lost links."""
     pairs, times = mission.links_lost
     if not len(pairs):

@@ -46,7 +46,7 @@ def check_margins(
     lags : of each vehicle
     """
     tracking = tracking_closed_loops(mission, lags)
-    laws, skipped = formation_closed_loops(mission, way, lags)
+    laws, skipped = loops_and_omission(mission, way, lags)
     by_place: dict[str, FormationMargins] = {}
     for where, loops, law, growth in laws:
         known, pole = by_place.get(where, _UNBOUNDED)
@@ -82,7 +82,7 @@ def tracking_closed_loops(mission: Mission, lags: Sequence[Lag]) -> ClosedLoops 
     return ClosedLoops("tracking", tracking_loops(lags), phase_gains(mission, None, None), GROWTH)
 
 
-def formation_closed_loops(
+def loops_and_omission(
     mission: Mission, way: Sequence[PlannedPhase], lags: Sequence[Lag]
 ) -> tuple[list[ClosedLoops], bool]:
     """The loops of each formation and of the ways between them, and whether some were left out to limit the work."""

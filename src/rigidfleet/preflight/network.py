@@ -68,7 +68,7 @@ def check_network(
         delay, growing = last_stable_delay(flight), None
         loss = greatest_stable_loss(flight) if radio.delay <= delay else None
         if latest > min(radio.delay, delay) or own.burst is not None or own.loss > (loss or 0.0):
-            growing = float((growth_in_network(flight, net, every) > _GROWS).mean())
+            growing = float((growth_rates_of_trials(flight, net, every) > _GROWS).mean())
         check = FormationNetwork(
             flight.n / (radio.every * radio.tick), radio.tick, delay, latest, loss, own.loss, growing, unheard
         )  # fmt: skip
@@ -170,9 +170,7 @@ def _last_delay(flight: LinearFlight, first: int, most: int, accuracy: float, gr
     return low
 
 
-def mean_square_growth(
-    flight: LinearFlight, losses: Floats, *, states: int, time: float = _TIME
-) -> Floats:
+def rms_growth(flight: LinearFlight, losses: Floats, *, states: int, time: float = _TIME) -> Floats:
     """Growth [1/s] of the root mean square of errors of edges, for each share of messages lost."""
     rng = np.random.default_rng(0)
     delay, every = flight.radio.delay, flight.radio.every
@@ -225,12 +223,12 @@ def greatest_stable_loss(flight: LinearFlight) -> float:
     stable = 0
     for step in (10, 1):  # in hundredths
         tried = np.arange(stable + step, stable + 10 * step, step)
-        grows = mean_square_growth(flight, tried / 100, states=states) > _GROWS
+        grows = rms_growth(flight, tried / 100, states=states) > _GROWS
         stable += step * int(np.append(grows, True).argmax())
     return stable / 100
 
 
-def growth_in_network(flight: LinearFlight, net: Links, every: int) -> Floats:
+def growth_rates_of_trials(flight: LinearFlight, net: Links, every: int) -> Floats:
     """Growth [1/s] of the errors of edges in some flights (B,) with the losses, jitter and time-outs of a network."""
     rng, delay, L = np.random.default_rng(0), flight.radio.delay, len(flight.links)
     late = math.ceil((net.delay + net.jitter) / every) - delay

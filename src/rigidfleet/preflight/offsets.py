@@ -20,7 +20,7 @@ from rigidfleet.math.margins import constraint_share_matrix
 from rigidfleet.math.pid import matrix_exponential
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import PlannedPhase
-from rigidfleet.planning.vehicles import airflow_force, jet_speeds
+from rigidfleet.planning.vehicles import airflow_force, pair_jet_speeds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
 from rigidfleet.preflight.margins import phase_gains
@@ -39,7 +39,7 @@ _SHAPES = 16
 _SMALL = 0.05
 
 
-def offsets_from_slots(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
+def sampled_slot_offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
     """Offsets (K, N, 3) [m] of the vehicles from their slots in each planned phase; zeros where none are tracked."""
     tracked = [planned.leg.phase.control == "tracking" for planned in way]
     pushes = [
@@ -75,7 +75,7 @@ def _unmodelled_accelerations(mission: Mission, planned: PlannedPhase) -> Floats
     up = np.array([0.0, 0.0, 1.0])
     air = np.zeros(3) if d is None else np.array(d.wind)
     if d is not None and d.downwash and mission.n_agents <= STACKED:
-        air = air - jet_speeds(mission, planned.position).sum(axis=2)[..., None] * up
+        air = air - pair_jet_speeds(mission, planned.position).sum(axis=2)[..., None] * up
     force = airflow_force(mission, air - v)
     if mission.tracking.drag_feedforward:
         known = airflow_force(mission, -v)
@@ -117,7 +117,7 @@ def steady_offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Re
     if not mission.tracking.integral:
         remedy = f"; tracking has no integral: raise the first weight in tracking.Q (now {mission.tracking.Q[0]:g})"
         remedy += ", or set tracking.integral" if mission.vehicle_models is not None else ""
-    for planned, off in zip(way, offsets_from_slots(mission, way), strict=True):
+    for planned, off in zip(way, sampled_slot_offsets(mission, way), strict=True):
         far = float(np.linalg.norm(off, axis=2).max())
         if planned.leg.end > mission.first_loss or far < _LEAST:
             continue

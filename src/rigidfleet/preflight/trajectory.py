@@ -131,7 +131,7 @@ def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             yield Remark("fails" if exact else "note", "downwash", text)
 
 
-def _force_nearest_to_limit(
+def _worst_force_time_and_limit(
     way: list[PlannedPhase], needs: list[Floats], limits: Floats
 ) -> tuple[float, float, str, float]:
     """Of the forces (K, N) [N] of each phase, the one nearest to its limit (N,) [N], or the greatest if there is none.
@@ -151,12 +151,12 @@ def find_greatest(mission: Mission, preflight: Preflight) -> None:
         return
     mass, weight = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
     needs = [mass * np.linalg.norm(planned.acceleration + weight, axis=2) for planned in way]
-    preflight.thrust = _force_nearest_to_limit(way, needs, mission.fleet.thrust_limit)
+    preflight.thrust = _worst_force_time_and_limit(way, needs, mission.fleet.thrust_limit)
     speeds = [np.linalg.norm(planned.velocity, axis=2) for planned in way]
     climbs = [np.abs(planned.velocity[..., 2]) for planned in way]
     unlimited = np.full(mission.n_agents, np.inf)
-    preflight.speed = _force_nearest_to_limit(way, speeds, unlimited)[:3]
-    preflight.vertical_speed = _force_nearest_to_limit(way, climbs, unlimited)[:3]
+    preflight.speed = _worst_force_time_and_limit(way, speeds, unlimited)[:3]
+    preflight.vertical_speed = _worst_force_time_and_limit(way, climbs, unlimited)[:3]
 
 
 def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -178,7 +178,7 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
         force = true[:, None] * (planned.acceleration + g * up)
         force -= drag[:, None] * (wind - planned.velocity)
         needs.append(np.linalg.norm(force, axis=2) + gusts + noise)
-    most = _force_nearest_to_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
+    most = _worst_force_time_and_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
     steady = airflow_force(mission, np.tile(wind, (len(drag), 1)))
     steady -= ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
@@ -229,7 +229,7 @@ def reference_step_remarks(mission: Mission, preflight: Preflight) -> Iterator[R
             yield Remark("fails" if c.solver in ("exact", "pinv") else "note", "thrust", text)
 
 
-def waypoint_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
+def waypoint_miss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on goals that the body misses even without errors of control: its regulator has too little time."""
     masses = mission.fleet.mass
     begun = True  # whether the phase begins when and where it is planned

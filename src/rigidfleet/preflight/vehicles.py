@@ -18,8 +18,8 @@ from rigidfleet.planning.vehicles import (
     airflow_force,
     commanded_yaw,
     initial_yaw,
-    jet_speeds,
-    slots_and_yaw,
+    pair_jet_speeds,
+    slot_taylor_and_yaw,
     yaw_turn,
 )
 from rigidfleet.preflight.findings import Preflight, Remark, VehicleCheck
@@ -53,14 +53,14 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
         count = min(max(_SAMPLES, int((leg.end - leg.start) / _STEP) + 1), _MOST)
         time = np.linspace(leg.start, leg.end, max(11, min(count, _PLACES // n)))
         turn = yaw_turn(leg.reference, leg.motion, leg.start, setting, angle)
-        slots, turned, _ = slots_and_yaw(leg.reference, leg.motion, time, setting, turn)
+        slots, turned, _ = slot_taylor_and_yaw(leg.reference, leg.motion, time, setting, turn)
         angle, yaw = turned[:2, :, -1], turned.transpose(2, 0, 1)
         x = series.taylor_derivatives(slots).transpose(3, 0, 2, 1)
         for i, model in enumerate(models):
             if not model.point:
                 need = _needs_of_path(model, x[:, :, i], yaw[:, :, i], mission.gravity)
                 needs.append(_needs_of_phase(model, need, time, f"agent {i + 1}", planned.phase))
-    jump = _greatest_acceleration_jump(mission, tracked)
+    jump = _worst_accel_and_tilt_jump(mission, tracked)
     return VehicleCheck(
         rotor_force=max((x.rotor_force for x in needs), key=lambda force: force[0] / force[3]),
         tilt=max((x.tilt for x in needs), key=lambda tilt: tilt[0]),
@@ -103,7 +103,7 @@ def _needs_of_path(model: VehicleModel, x: Floats, yaw: Floats, g: float) -> Fla
     return flat(force, yaw)
 
 
-def _greatest_acceleration_jump(
+def _worst_accel_and_tilt_jump(
     mission: Mission, way: Sequence[PlannedPhase]
 ) -> tuple[float, float, float, str] | None:
     """The greatest jump of the reference's acceleration [m/s^2], of the tilt [deg], its time [s], and the phase."""
@@ -153,7 +153,7 @@ def _jet_remarks(mission: Mission, way: Sequence[PlannedPhase]) -> Iterator[Rema
     assert models is not None
     worst = (0.0, 0.0, 0.0, 0, 0, 0.0, 0.0, "")
     for planned in way if mission.n_agents <= STACKED else ():
-        flow = jet_speeds(mission, planned.position)
+        flow = pair_jet_speeds(mission, planned.position)
         down = np.zeros((*flow.shape, 3))
         down[..., 2] = flow
         push = airflow_force(mission, down.swapaxes(1, 2)).swapaxes(1, 2)[..., 2]

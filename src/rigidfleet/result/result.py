@@ -23,7 +23,7 @@ from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.errors import MissionError, ResultError, wrong_type
 from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, netcdf_content, read_netcdf
 from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
-from rigidfleet.setpoints import Setpoints, csv_text, setpoints_at_rate, states_of_motion
+from rigidfleet.setpoints import Setpoints, csv_text, setpoints_at_rate, states_with_jerk
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -536,7 +536,7 @@ class Result(Shown):
             # Forces jump where two samples have one time: at a change of phase and at a loss.
             jumps = np.flatnonzero(np.nextafter(self.time[:-1], np.inf) >= self.time[1:]) + 1
             parts = zip(*(np.split(x, jumps) for x in (*motion, self.time)), strict=True)
-            state = np.concatenate([states_of_motion(*part) for part in parts])
+            state = np.concatenate([states_with_jerk(*part) for part in parts])
         yaw = [nothing[:, :, 0] if x is None else x for x in (self.yaw, self.yaw_rate)]
         return Setpoints(self.time, state, *yaw)
 

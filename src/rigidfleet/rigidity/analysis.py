@@ -175,7 +175,7 @@ def analyse(
         redundant=frame.redundant_edges(),
         spare=frame.jointly_removable_edges(),
         flexes=flexes,
-        index=_rigidity_index(frame, masses),
+        index=_least_singular_value(frame, masses),
         rigidity_class=rigidity_class,
         reason=reason,
         stress=stress,
@@ -235,14 +235,14 @@ def flatten_points(p: Floats, space: int) -> tuple[Floats, Floats]:
     return np.pad(x @ axes[:d].T, [(0, 0), (0, space - d)]), axes
 
 
-def _rigidity_index(frame: Framework, masses: ArrayLike | None) -> float:
+def _least_singular_value(frame: Framework, masses: ArrayLike | None) -> float:
     if masses is None:
         return float(frame.s[-1]) if frame.rank else np.nan
     m = np.asarray(masses, dtype=np.float64)
     if m.shape != (len(frame.p),) or not (m > 0).all() or not np.isfinite(m).all():
         raise ValueError(f"masses must be {len(frame.p)} numbers > 0 [kg]")
     if not frame.rank or (m == m[0]).all():
-        return _rigidity_index(frame, None)
+        return _least_singular_value(frame, None)
     J = jacobian(frame.p, frame.edges)
     weighted = J * np.repeat(np.sqrt(m.mean() / m), frame.p.shape[1])
     return float(np.linalg.svd(weighted, compute_uv=False)[frame.rank - 1])

@@ -88,20 +88,20 @@ def design(
     rank = full_rank(n, d)
     if rank == 0:
         return near if extra == "complete" else near[:0]
-    rows = _nonrigid_jacobian_rows(flat, edges)
+    rows = _jacobian_nonrigid_part(flat, edges)
     _assert_reach_holds_shape(rows, length, reach, rank)
     wanted = len(near) if extra == "complete" else rank + extra
     if wanted >= len(near):
         return near
     rows = rows[length <= reach]
     meshes = [np.arange(len(near)), *_delaunay_and_hull_edges(flat, near)]
-    starts = [_add_rows(rows, _remove_rows(rows, some, wanted), wanted) for some in meshes]
+    starts = [_add_rows(rows, _keep_best_rows(rows, some, wanted), wanted) for some in meshes]
     chosen = max(starts, key=lambda some: _least_eigenvalue(rows[some]))
     rng = np.random.default_rng(seed)
     best, best_w = chosen, _least_eigenvalue(rows[chosen])
     work, idle = 0.0, 0
     while True:
-        chosen, used = _improve_by_exchange(rows, chosen)
+        chosen, used = _better_rows_and_work(rows, chosen)
         w = _least_eigenvalue(rows[chosen])
         idle += 1
         if w > best_w * (1 + 1e-9):
@@ -143,7 +143,7 @@ def mission_fragment(
     return to_toml({"formations": {name: {"slots": points, "edges": pairs, "reach": reach}}})
 
 
-def _nonrigid_jacobian_rows(flat: Floats, edges: Ints) -> Floats:
+def _jacobian_nonrigid_part(flat: Floats, edges: Ints) -> Floats:
     """Rows of J (m, r) in coordinates of the non-rigid motions."""
     n, d = flat.shape
     rigid = rigid_motions(flat)
@@ -195,7 +195,7 @@ def _delaunay_and_hull_edges(flat: Floats, near: Ints) -> list[Ints]:
     return meshes
 
 
-def _remove_rows(rows: Floats, chosen: Ints, wanted: int) -> Ints:
+def _keep_best_rows(rows: Floats, chosen: Ints, wanted: int) -> Ints:
     """The chosen rows reduced to (wanted,): the least useful are removed, a tenth of the surplus at a time.
 
     Without row a, tr M^-1 grows by |M^-1 a|^2 / (1 - a^T M^-1 a).
@@ -232,7 +232,7 @@ def _add_rows(rows: Floats, chosen: Ints, wanted: int) -> Ints:
     return chosen
 
 
-def _improve_by_exchange(rows: Floats, chosen: Ints) -> tuple[Ints, float]:
+def _better_rows_and_work(rows: Floats, chosen: Ints) -> tuple[Ints, float]:
     """A design that no exchange of one edge improves, and the work spent."""
     m, r = rows.shape
     work = 0.0

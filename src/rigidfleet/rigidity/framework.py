@@ -205,11 +205,11 @@ def sparse_flexes(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) ->
     motions = []
     for i in seeds[:: max(1, -(-len(seeds) // most))]:
         for way in _basis_near_axes(part[i][:, strength[i] > (1.0 - _ALIKE) * strength[i, 0]]):
-            motions.append(_stop_slow_agents(_motion_of_least_speed(way @ blocks[i], V, n), V))
+            motions.append(_stop_slow_agents(_motion_of_least_speed_sum(way @ blocks[i], V, n), V))
     return motions
 
 
-def _motion_of_least_speed(c: Floats, V: Floats, n: int) -> Floats:
+def _motion_of_least_speed_sum(c: Floats, V: Floats, n: int) -> Floats:
     """The motion V a (n, d) with c a = 1 whose sum of speeds is least, by iteratively reweighted least squares."""
     speed = np.ones(n)
     for sharp in np.logspace(0, -7, 20):

@@ -98,7 +98,7 @@ def blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
     if frame.stress_dimension == 0:
         return None, np.eye(energy.k), True
     if frame.stress_dimension > 1:
-        return _search_blocking_stress(energy)
+        return _blocking_stress_or_proof(energy)
     z = np.zeros(len(frame.edges))
     z[(frame.span**2).sum(axis=1).argmin()] = 1
     force = energy.nearest_stress(z)
@@ -112,7 +112,7 @@ def blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
     return None, vector[:, value < small] if value[0] > -small else vector, True
 
 
-def _search_blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
+def _blocking_stress_or_proof(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
     from scipy.optimize import minimize
 
     unit = np.eye(energy.k)
@@ -157,7 +157,7 @@ def deform_by_finite_flex(energy: StressEnergy) -> tuple[Floats | None, bool]:
     candidates += list(np.random.default_rng(0).normal(size=(_STARTS, energy.k)))
     goes_on = False
     for q in candidates:
-        flex = _extend_to_second_order(energy, q)
+        flex = _extendable_flex_near(energy, q)
         if flex is None:
             continue
         goes_on = True
@@ -168,7 +168,7 @@ def deform_by_finite_flex(energy: StressEnergy) -> tuple[Floats | None, bool]:
     return None, goes_on
 
 
-def _extend_to_second_order(energy: StressEnergy, q: Floats) -> Floats | None:
+def _extendable_flex_near(energy: StressEnergy, q: Floats) -> Floats | None:
     """A flex (k,) near q that extends to second order, by Gauss-Newton on the unit sphere."""
     q = q / max(np.linalg.norm(q), 1e-9)
     for _ in range(40):

@@ -188,7 +188,7 @@ class CurveWatch:
             steps, points = state.trail.clock[rows], state.trail.points[rows]
             while steps[-1].sum() - steps[0, 0] > _INSTANT:
                 if len(steps) == 1:
-                    steps, points = _halve_step(*steps[0], points[0])
+                    steps, points = _half_steps_and_points(*steps[0], points[0])
                 half = len(steps) // 2
                 part = slice(half) if deepest(steps[:half], points[:half]) else slice(half, None)
                 steps, points = steps[part], points[part]
@@ -302,7 +302,7 @@ class CurveWatch:
             far = 0.0 if self.n > _CROWD and length > _INSTANT else float(moved.max())
             self._list_near_pairs(problem, points[0, 0], far)
             if moved.max() > self.spare:
-                for half in zip(*_halve_step(begin, length, points[0]), strict=True):
+                for half in zip(*_half_steps_and_points(begin, length, points[0]), strict=True):
                     self._watch_step(problem, work, state, *(x[None] for x in half))
                 return
         self.moved += moved
@@ -537,7 +537,7 @@ class Extremes(CurveWatch):
         return extremes
 
 
-def _halve_step(t: float, h: float, points: Floats) -> tuple[Floats, Floats]:
+def _half_steps_and_points(t: float, h: float, points: Floats) -> tuple[Floats, Floats]:
     """Starts and lengths (2, 2) [s], and control points (2, 5, n), of both halves of a step with points (5, n)."""
     knots = (records.KNOTS + [[0.0], [1.0]]) / 2.0
     clock = np.array([[t, 0.5 * h], [t + 0.5 * h, 0.5 * h]])

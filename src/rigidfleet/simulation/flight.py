@@ -30,7 +30,7 @@ from rigidfleet.planning.reference import PhaseState, Pose, copy_with
 from rigidfleet.planning.timing import complete_times, timed_leg
 from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
-from rigidfleet.simulation.as_flown import check_formation, mission_as_flown, phase_of_table
+from rigidfleet.simulation.as_flown import check_formation_exists, mission_as_flown, phase_of_table
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
     Controller,
@@ -384,9 +384,9 @@ class Flight:
                 self.mission, self._phases_begun[:flown], self.phases[:flown], phase
             )
         else:
-            check_formation(self.mission, phase)
+            check_formation_exists(self.mission, phase)
         self._leave_phase(changed=True)
-        if self.mission.on_loss == "continue" or not self._is_route_phase(phase):
+        if self.mission.on_loss == "continue" or not self._is_from_route(phase):
             self._state_now.blend = None
         if self._phases_begun:
             self._report_progress(phase, planning=True)
@@ -401,7 +401,7 @@ class Flight:
                 leg = copy_with(leg, before=copy_with(leg.before))
             plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
-            self._check_not_flipped(plan)
+            self._stop_if_flipped(plan)
             fly = PointPhase
             if self._vehicles is not None:
                 fly = partial(SampledPhase, vehicles=self._vehicles)
@@ -661,10 +661,10 @@ class Flight:
 
         Phases begun by hand go on: who began them decides.
         """
-        routed = self._is_route_phase(self._phases_begun[-1])
+        routed = self._is_from_route(self._phases_begun[-1])
         return self.mission.abandons_at if routed and not self._reacted else math.inf
 
-    def _is_route_phase(self, phase: Phase) -> bool:
+    def _is_from_route(self, phase: Phase) -> bool:
         """Whether the route gives a phase that has begun last, or is about to."""
         return self._following > 0 and phase is self._route[self._following - 1]
 
@@ -704,7 +704,7 @@ class Flight:
         if (
             not active.has_flown
         ):  # as if it had never begun: if it is the mission's, it is still to come
-            self._following -= self._is_route_phase(self._phases_begun[-1])
+            self._following -= self._is_from_route(self._phases_begun[-1])
             del self.phases[-1], self._phases_begun[-1], self._plans[-1:]
             return
         if not (active.has_settled or active.is_over or abandoned):
@@ -738,7 +738,7 @@ class Flight:
         ):
             record.stay = active.plan.end_state_record(active.t)
 
-    def _check_not_flipped(self, plan: PhasePlan) -> None:
+    def _stop_if_flipped(self, plan: PhasePlan) -> None:
         """Stop if the formation has flipped: its slots no longer agree with the body frame."""
         both = {plan.phase.control, *(phase.control for phase in self._phases_begun[-1:])}
         now = self._state_now

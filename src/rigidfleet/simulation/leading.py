@@ -124,10 +124,10 @@ class Leader:
         h = end - t
         acts = self._can_lead(t + h)
         self.clock.set_aim(
-            *(self._clock_rate(t, a) if acts and self.settings.clock else (1.0, np.inf))
+            *(self._rate_and_bandwidth(t, a) if acts and self.settings.clock else (1.0, np.inf))
         )
         accelerations = (
-            self._detour_accels(t, a) if acts and self.settings.body else self.deviation.decay()
+            self._deviation_accels(t, a) if acts and self.settings.body else self.deviation.decay()
         )
         if self.clock.has_unit_rate and self.deviation.is_zero and not accelerations.any():
             self.now = None
@@ -179,7 +179,7 @@ class Leader:
         reference = self.problem.reference
         return reference.kind != SQUARED or t - self.clock.delay >= reference.t0 + reference.T_b
 
-    def _clock_rate(self, t: float, a: AvoidanceArrays) -> tuple[float, float]:
+    def _rate_and_bandwidth(self, t: float, a: AvoidanceArrays) -> tuple[float, float]:
         """The rate to aim at, and the bandwidth of the clock.
 
         The greatest one at which the slots keep away from all that moves, as far as it is known, over the horizon; if
@@ -240,7 +240,7 @@ class Leader:
             return time + lost
 
         plan = self.plan
-        plan.postpone_events(postponed_time)
+        plan.postpone_arrival(postponed_time)
         if begun < (blend := plan.reference).t0 + blend.T_b:
             plan.reference = blend._replace(t0=blend.t0 + lost)
 
@@ -280,7 +280,7 @@ class Leader:
         grown = series.product(series.series_by_derivatives(p), grows[:, None, None])
         p = series.taylor_derivatives(grown)
         B = series.product(np.moveaxis(turns, -1, 1), np.moveaxis(B, -1, 1), np.matmul)
-        phi = series.taylor_derivatives(series.rotation_vector_series(B[0, 0].T @ B))
+        phi = series.taylor_derivatives(series.rotation_vector_taylor(B[0, 0].T @ B))
         channels = np.concatenate([x.transpose(0, 2, 1), phi], axis=2)  # (3, ends, 6)
         polynomials = Motion(times, _quintics(times, channels), np.ascontiguousarray(B[0, 0].T))
         late, scaled = delay_by(problem, self.clock.delay).reference, self._is_any_scaled(ends)
@@ -298,14 +298,14 @@ class Leader:
 
     # -- the body -----------------------------------------------------------------------------------------
 
-    def _detour_accels(self, t: float, a: AvoidanceArrays) -> Floats:
+    def _deviation_accels(self, t: float, a: AvoidanceArrays) -> Floats:
         """Second derivatives (7,) of the deviation to take: those of its decay, changed as barriers need."""
         accelerations, self.calm = self.deviation.decay(), True
         sight = a.sight
         moving = np.flatnonzero((sight.moves == 1) & (sight.known == KNOWN))
         if not len(moving) and self.deviation.is_zero:
             return accelerations
-        r, v, rise, arms = self._slot_motion(t)
+        r, v, rise, arms = self._slot_motion_and_arms(t)
         z = self.deviation.scale[0]
         limit = _STEERING * float(a.b.min())
         cones = (self._moving_obstacle_barriers(o, r, v, rise, a) for o in moving)
@@ -348,7 +348,7 @@ class Leader:
         d = np.linalg.norm(plan.slots[i] - plan.slots[j], axis=1)
         return np.allclose(d, plan.distances, rtol=0.0, atol=1e-6)
 
-    def _slot_motion(self, t: float) -> tuple[Floats, Floats, Floats, Floats]:
+    def _slot_motion_and_arms(self, t: float) -> tuple[Floats, Floats, Floats, Floats]:
         """Slots (N, 3), velocities, accelerations without those of the deviation, and arms from the body's origin."""
         tau = np.array([t - self.clock.delay])
         cm, axes = body_taylor(self.problem.motion, tau, 3)

@@ -115,7 +115,7 @@ class OwnLaws:
                 continue
             answer = call_user_code(f"the law of agent {i + 1}", where, self.laws[i], view)
             try:
-                state.f_u[i], said[i], numbers = _parse_law_answer(answer)
+                state.f_u[i], said[i], numbers = _force_message_and_size(answer)
             except ValueError as unfit:
                 what, remedy = unfit.args
                 what = f"the law of agent {i + 1} returned {what} {where}: {remedy}"
@@ -169,7 +169,7 @@ class OwnLaws:
         return views
 
 
-def _parse_law_answer(answer: Any) -> tuple[Floats, Any, int]:
+def _force_message_and_size(answer: Any) -> tuple[Floats, Any, int]:
     """Force (3,) [N] of what a law returned, a copy of its message, and how many numbers that has.
 
     Raises

@@ -23,7 +23,7 @@ from rigidfleet.planning.derivatives import (
     slots_by_own_clocks,
     yaw_derivatives,
 )
-from rigidfleet.planning.vehicles import YawTurn, commanded_yaw, slots_and_yaw
+from rigidfleet.planning.vehicles import YawTurn, commanded_yaw, slot_taylor_and_yaw
 from rigidfleet.result import CLOSE, LATER, RECORDED, SEEN, Extremum, PhaseRecord, Result
 from rigidfleet.simulation.solver_setup import large_solver, problem_with_solver, workspace_of
 from rigidfleet.typing import Bools, Floats, Ints
@@ -293,7 +293,7 @@ def _forces_and_references(
         "distance_rate_reference": record.d_dot,
         "constraint": constraint,
         "multiplier": record.multiplier,
-        "integral": _error_integrals(pieces, mission.edges),
+        "integral": _integral_samples(pieces, mission.edges),
     }
 
 
@@ -323,7 +323,7 @@ def closeness_arrays(
     if left is None:
         left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
     close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
-    _insert(worst, time, close)
+    _lower_closeness(worst, time, close)
     arrays = close.separation, close.pair, close.clearance, close.agent, close.obstacle
     return dict(zip(CLOSE, arrays, strict=True))
 
@@ -387,7 +387,7 @@ def _yaw_of_turn(
 ) -> Floats:
     """Yaw and its rate (K, 2, N) asked of vehicles that turn into it from the yaw they had."""
     since = np.concatenate([[turn.begun], time])
-    return slots_and_yaw(reference, motion, since, yaw, turn)[1][:2, :, 1:].transpose(2, 0, 1)
+    return slot_taylor_and_yaw(reference, motion, since, yaw, turn)[1][:2, :, 1:].transpose(2, 0, 1)
 
 
 def _vehicle_samples(pieces: Sequence[Piece]) -> VehicleSamples | None:
@@ -405,7 +405,9 @@ def _concatenate_samples(pieces: Sequence[Samples]) -> Samples:
     return type(pieces[0])(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
 
 
-def _insert(worst: Sequence[dict[str, Extremum]], time: Floats, close: proximity.Closeness) -> None:
+def _lower_closeness(
+    worst: Sequence[dict[str, Extremum]], time: Floats, close: proximity.Closeness
+) -> None:
     """Enter extremes between samples at the sample after each."""
     for name, values in (("separation", close.separation), ("clearance", close.clearance)):
         every = [extremes[name] for extremes in worst if name in extremes]
@@ -460,7 +462,7 @@ def _join_records(pieces: Sequence[Piece], n: int, edges: Ints, *, disturbed: bo
     return out
 
 
-def _error_integrals(pieces: Sequence[Piece], edges: Ints) -> Floats:
+def _integral_samples(pieces: Sequence[Piece], edges: Ints) -> Floats:
     """Integrals of the constraint errors (K, m); NaN while an edge is not active."""
     rows = []
     for piece in pieces:

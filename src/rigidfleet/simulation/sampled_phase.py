@@ -219,7 +219,7 @@ class SampledPhase(ActivePhase):
                 return time
             return due + float(np.interp(due, [passed, max(now, passed + 1e-9)], [before, late]))
 
-        plan.postpone_events(postponed_time)
+        plan.postpone_arrival(postponed_time)
         if self.slowed is None and (self.sampled.tau[:, PACE] < _SLOWED).any():
             self.slowed = t, int(self.sampled.tau[:, WORST].argmax())
 
@@ -338,7 +338,7 @@ class SampledPhase(ActivePhase):
                 elif laws is not None:
                     laws.call_laws(plan.phase.name, problem, self.workspace, self.flight, sampled)
                 status = fly_ticks(problem, self.workspace, self.flight, sampled, call, arrays)
-                self._copy_true_state()
+                self._update_integrator_state()
                 if status == records.ASKS:
                     continue
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
@@ -394,7 +394,7 @@ class SampledPhase(ActivePhase):
                 np.add(known, moved, out=known)
         self.flight, self.tabled = self.flight._replace(tables=made), planned
 
-    def _copy_true_state(self) -> None:
+    def _update_integrator_state(self) -> None:
         """Take over the true state, and what it cost."""
         plan, state, sampled = self.plan, self.state, self.sampled
         n, m, y = len(plan.masses), len(plan.edges), state.y
@@ -448,7 +448,7 @@ class SampledPhase(ActivePhase):
             tau = tau[..., :0]
         out, kept = _flown_record(planned, call, done, self.flight, problem, tau)
         self.store_piece(
-            times, out, call.integral[:done], frame, kept, self._layer_samples(call, done)
+            times, out, call.integral[:done], frame, kept, self._avoidance_samples(call, done)
         )
 
     def _record_by_own_clocks(self, times: Floats, y: Floats, tau: Floats) -> Record:
@@ -464,7 +464,7 @@ class SampledPhase(ActivePhase):
             np.multiply(x, rate[:, None], out=x)
         return planned
 
-    def _layer_samples(self, call: fleet.SampledSegment, done: int) -> LayerSamples | None:
+    def _avoidance_samples(self, call: fleet.SampledSegment, done: int) -> LayerSamples | None:
         """Samples of what avoidance did."""
         if self.vehicles.avoidance is None:
             return None

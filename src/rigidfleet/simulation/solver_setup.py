@@ -41,7 +41,7 @@ def workspace_and_solver(
         order = None if steps is None else ordering.pivot_order(steps, plan.problem.graph.edges)
     axes = plan.problem.has_frame or plan.problem.law.k_def > 0.0
     dissect = partial(solvers.agent_dissection_order, points, edges)
-    solver = large_solver(plan.problem, Setup(order, dissect, *plan.residual_tolerances(), axes))
+    solver = large_solver(plan.problem, Setup(order, dissect, *plan.solver_rtol_and_atol(), axes))
     plan.problem = problem_with_solver(solver, plan.problem)
     return solver.workspace, solver
 

@@ -72,14 +72,14 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
 def _can_share_steps(active: Sequence[ActivePhase]) -> bool:
     """Whether phases differ in nothing but numbers, so that they can share steps."""
     first = _sharing_key(active[0])
-    if not all(_can_fly_together(phase) and _sharing_key(phase) == first for phase in active):
+    if not all(_allows_common_steps(phase) and _sharing_key(phase) == first for phase in active):
         return False
     from rigidfleet.kernel.engine import batch
 
     return batch.can_unroll_together([phase.plan.problem for phase in active])
 
 
-def _can_fly_together(phase: ActivePhase) -> bool:
+def _allows_common_steps(phase: ActivePhase) -> bool:
     """Whether a phase has a given duration, without losses, calls of users' functions, fences and people."""
     plan = phase.plan
     return (

@@ -35,7 +35,7 @@ from rigidfleet.math.piecewise import (
 from rigidfleet.mission import Mission, as_mission
 from rigidfleet.result import Extremum, PhaseRecord, Result, presence
 from rigidfleet.result.result import CLOSE, VARIABLES
-from rigidfleet.setpoints import interval_starts
+from rigidfleet.setpoints import interval_starts_and_knots
 from rigidfleet.simulation.extremes import CurveWatch
 from rigidfleet.simulation.recording import closeness_arrays, mission_text_entry
 from rigidfleet.typing import Floats, Ints
@@ -144,7 +144,7 @@ def trajectories(
             f"times must increase: sample {k + 2} is at {t[k + 1]:g} s, the one before at {t[k]:g} s."
         )
     # A sample that is one representable number after another marks a jump, as at a switch of phases in a result.
-    first, knots = interval_starts(t)
+    first, knots = interval_starts_and_knots(t)
     if not len(first):
         raise ResultError(f"all samples are at {t[0]:g} s; a trajectory lasts.")
     yaws = np.full(shape[:2], np.nan) if yaw is None else _check_numbers("yaw", yaw, *shape[:2])
@@ -297,7 +297,7 @@ def result_of_curve(
     record.extremes.update(watch.end_phase())
     watch.add_extremes_to_phases([record])
     record.extremes.update(fastest)
-    at, state, yaws = _sample_curve(curve, parts)
+    at, state, yaws = _sample_motion_and_yaw(curve, parts)
     if powers < 3:  # lines turn at once at samples
         state[2:] = np.nan
     facts = {"interpolation": interpolation, "names": list(names), "spans": spans, "clock": zero}
@@ -373,7 +373,7 @@ def _refuse_jumps(curve: Piecewise) -> None:
         )
 
 
-def _sample_curve(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats]:
+def _sample_motion_and_yaw(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats]:
     """Times (K,) [s], position to jerk (4, K, N, 3), and yaw and its rate (2, K, N), at ends of equal parts of pieces.
 
     Where states jump, there are two samples. Where the rate of yaw jumps, it is the mean.
@@ -451,7 +451,7 @@ def _watch_positions(
             watch.keep_only(here[first])
         if not here[first].any():
             continue
-        part = way.refine(knots[first : last + 1])
+        part = way.with_knots(knots[first : last + 1])
         at = [x.at_shares(records.KNOTS) for x in (part, part.derivative_curve())]
         points = np.concatenate([x.reshape(*x.shape[:2], -1) for x in at], axis=2)
         clock = np.column_stack([part.time[:-1], np.diff(part.time)])

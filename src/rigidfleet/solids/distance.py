@@ -125,7 +125,7 @@ def edge_side(x: Numbers, y: Numbers, z: Numbers, a: Any, b: Any, normal: Any) -
     return (v * z - w * y) * normal[0] + (w * x - u * z) * normal[1] + (u * y - v * x) * normal[2]
 
 
-def facet_normal(t: Any) -> Any:
+def facet_cross_product(t: Any) -> Any:
     """Normal of a triangle (3, 3), twice as long as its area is large."""
     e, f, g = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
     p, q, r = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
@@ -134,7 +134,7 @@ def facet_normal(t: Any) -> Any:
 
 def vector_from_triangle(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
     """Vector from the nearest point of a triangle (3, 3) to the point, and its squared length."""
-    a, b, c, n = t[0], t[1], t[2], facet_normal(t)
+    a, b, c, n = t[0], t[1], t[2], facet_cross_product(t)
     area = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
     i, j, k = vector_from_segment(x, y, z, a, b)
     best = i * i + j * j + k * k
@@ -203,7 +203,7 @@ def is_inside(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
         return inside & (z <= height)
     for m in range(s.first[b, 1], s.last[b, 1]):
         t = s.triangles[m]
-        n = facet_normal(t)
+        n = facet_cross_product(t)
         out = (x - t[0, 0]) * n[0] + (y - t[0, 1]) * n[1] + (z - t[0, 2]) * n[2]
         inside = inside & (out <= 0.0)
     return inside
@@ -330,7 +330,7 @@ def height_below(x: Numbers, y: Numbers, z: Numbers, s: Any) -> Numbers:
 #: The functions that the kernel compiles, each after those that it calls.
 ELEMENTWISE = (
     choose, box_distance, box_normal, cylinder_distance, cylinder_normal,
-    vector_from_segment, edge_side, facet_normal, vector_from_triangle, height_map_point, vector_from_solid_surface,
-    is_inside, signed_distance, outward_normal, solid_displacement, is_solid_present, local_point, is_solid_below,
-    height_range, height_below,
+    vector_from_segment, edge_side, facet_cross_product, vector_from_triangle, height_map_point,
+    vector_from_solid_surface, is_inside, signed_distance, outward_normal, solid_displacement, is_solid_present,
+    local_point, is_solid_below, height_range, height_below,
 )  # fmt: skip

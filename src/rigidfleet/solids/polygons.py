@@ -43,9 +43,9 @@ class Region(NamedTuple):
         """Signed distance (M,) [m] of points (M, 2) from the area as seen from above: negative inside."""
         some = max(1, _TOGETHER // len(self.edges))
         parts = np.split(x, range(some, len(x), some))
-        return np.concatenate([self._distance(self._edge_to_points(part), part) for part in parts])
+        return np.concatenate([self._distance(self._from_edges(part), part) for part in parts])
 
-    def depths_of_curves(self, points: Floats, *, outside: bool) -> tuple[Floats, Floats]:
+    def curve_depths_and_bounds(self, points: Floats, *, outside: bool) -> tuple[Floats, Floats]:
         """By how much curves are inside (or ``outside``) at their middles (M,) [m], and an upper bound (M,) all along.
 
         A curve lies in the hull of its control points (M, 3, P). Where it stays on the one side, the nearest edge is at
@@ -65,8 +65,8 @@ class Region(NamedTuple):
         return -now, -prism_distance(-bound, np.maximum(low - greatest, least - high))
 
     def _depth(self, points: Floats, c: Floats, *, outside: bool) -> tuple[Floats, Floats]:
-        """`depths_of_curves` as seen from above, of control points (M, 2, P) with middles (M, 2)."""
-        off = self._edge_to_points(c)
+        """`curve_depths_and_bounds` as seen from above, of control points (M, 2, P) with middles (M, 2)."""
+        off = self._from_edges(c)
         apart = np.linalg.norm(off, axis=2)
         now = self._distance(off, c) * (1.0 if outside else -1.0)
         spread = points - c[:, :, None]
@@ -77,12 +77,12 @@ class Region(NamedTuple):
         bound[kept] = np.minimum(bound[kept], -(apart[kept] + tangents.min(axis=2)).min(axis=1))
         rest = np.flatnonzero((now >= 0.0) | (reach >= -now))
         ends = np.moveaxis(points[rest], 2, 1)
-        far = np.linalg.norm(self._edge_to_points(ends.reshape(-1, 2)), axis=2)
+        far = np.linalg.norm(self._from_edges(ends.reshape(-1, 2)), axis=2)
         far = far.reshape(len(rest), ends.shape[1], len(self.edges)).max(axis=1).min(axis=1)
         bound[rest] = np.minimum(bound[rest], far)
         return now, bound
 
-    def _edge_to_points(self, x: Floats) -> Floats:
+    def _from_edges(self, x: Floats) -> Floats:
         """Vectors (M, E, 2) to points (M, 2) from the nearest point of each edge."""
         begin, along = self.edges[:, 0], self.edges[:, 1] - self.edges[:, 0]
         off = x[:, None] - begin

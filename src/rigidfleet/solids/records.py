@@ -171,7 +171,7 @@ def one_solid(
     """
     times = np.asarray(times, dtype=float)
     ways = np.asarray(ways, dtype=float).reshape(-1, 3)
-    triangles, nodes, after, leaf = _bounding_tree(form.triangles)
+    triangles, nodes, after, leaf = _triangles_and_tree(form.triangles)
     last = [len(nodes), len(triangles), form.heights.size, len(times)]
     turned = bool(np.any(form.origin) or np.any(form.turn != _UPRIGHT))
     return Solids(
@@ -230,7 +230,7 @@ def swept_extent(solid: Solids) -> Floats:
     return ends
 
 
-def _bounding_tree(triangles: Floats) -> tuple[Floats, Floats, Ints, Ints]:
+def _triangles_and_tree(triangles: Floats) -> tuple[Floats, Floats, Ints, Ints]:
     """Triangles (T, 3, 3) in the order of a tree's leaves, and its nodes, depth first: corners, successors, leaves."""
     low, high = triangles.min(axis=1), triangles.max(axis=1)
     centre, order = (low + high) / 2, np.arange(len(triangles))

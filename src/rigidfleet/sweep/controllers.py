@@ -16,7 +16,7 @@ REMEDY = (
 )
 
 
-def add_search_folder(folder: str | Path) -> None:
+def add_module_folder(folder: str | Path) -> None:
     """Search a folder for modules, after all others: it hides none."""
     if (place := str(Path(folder).resolve())) not in sys.path:
         sys.path.append(place)
@@ -31,7 +31,7 @@ def import_law_and_digest(name: str) -> tuple[Any, str]:
         There is none, its module fails, or no controller can be made of the class. The message says why.
     """
     module, _, inside = name.partition(":")
-    add_search_folder("")
+    add_module_folder("")
     try:
         there = import_module(module)
         law = attrgetter(inside)(there)

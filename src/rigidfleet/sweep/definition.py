@@ -216,7 +216,7 @@ class Sweep:
         data |= {key: value for key, value in keys.items() if value is not None}
         if isinstance(own := data.get("vary", []), list):
             data["vary"] = [*own, *more]
-        controllers.add_search_folder(path.parent)
+        controllers.add_module_folder(path.parent)
         variations, header = _Check(data, origin, mission).variations_and_header()
         assert mission is not None  # otherwise the check has raised
         if header.drill:
@@ -499,9 +499,9 @@ class _Check:
             if (why := why_unfit_for_establish(self.mission)) is not None:
                 self.add(("evaluate",), why, _WHOLE, "final")
         if self.mission is not None:
-            self._check_added_keys(self.mission)
+            self._check_new_keys(self.mission)
         if header is not None and header.law_key_and_name[1]:
-            self._check_user_law(*header.law_key_and_name, header)
+            self._check_law_import(*header.law_key_and_name, header)
         if "rate" in self.data and not self.data.get("controller"):
             self.add(("rate",), "is that of a controller", "give a controller, or remove rate")
         self._check_groups(variations)
@@ -526,7 +526,7 @@ class _Check:
         variation = None if model is None else self.collector.validate(model, entry, where)
         if variation is None or len(self.collector.findings) > before:
             return None
-        if problem := variation.find_key_conflict():
+        if problem := variation.find_invalid_key():
             key, *words = problem
             self.add((*where, key), *words, getattr(variation, key))
             return None
@@ -573,7 +573,7 @@ class _Check:
                 continue
             self.add(where, problem, remedy, path)
 
-    def _check_added_keys(self, mission: Mission) -> None:
+    def _check_new_keys(self, mission: Mission) -> None:
         """Check that the mission accepts values for the keys that it does not have, all of them together."""
         document = mission.to_dict()
         for _, column in self.lacked:
@@ -591,7 +591,7 @@ class _Check:
                 remedy = f"in the mission, {finding.remedy}"
                 self.add(("vary", k, "path"), problem, remedy, column.variation.path)
 
-    def _check_user_law(self, key: str, name: str, header: SweepHeader) -> None:
+    def _check_law_import(self, key: str, name: str, header: SweepHeader) -> None:
         """Check that the user's law can be imported, and suits the mission."""
         try:
             controllers.import_law_and_digest(name)

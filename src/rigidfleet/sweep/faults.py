@@ -281,7 +281,7 @@ class Show:
         # A show that is moved as a whole changes no distance between its vehicles.
         if fault.kind in SETUP and len(fault.who) == self.n and not self.bounded:
             return {}, "", ""
-        result, every = self.flight_with_fault(fault)
+        result, every = self.flight_near_fault(fault)
         verdict = assess(result)
         failed = [check for check in verdict.checks if not check.passed]
         worst = {c.check: c.worst for c in verdict.checks if c.judged and c.check in METRICS}
@@ -294,7 +294,7 @@ class Show:
         words = _AGENTS.sub(renumber_in_fleet, failed[0].message) if failed else ""
         return worst, ", ".join(dict.fromkeys(check.check for check in failed)), words
 
-    def flight_with_fault(self, fault: GeometricFault) -> tuple[Result, Ints]:
+    def flight_near_fault(self, fault: GeometricFault) -> tuple[Result, Ints]:
         """The flight of the vehicles of a fault and of all that may come near them, and which (M,) these are."""
         from rigidfleet.simulation.trajectories import result_of_curve
 
@@ -303,11 +303,11 @@ class Show:
         way, knots = self.way_with_fault(fault), self.curve.time
         if not np.array_equal(knots, way.time):
             knots = common_knots([self.curve, way])
-        way = way.refine(knots, stays=True)
+        way = way.with_knots(knots, stays=True)
         if fault.kind not in SETUP or not again.all():
             again |= self._may_be_nearest(who, _Chords.of(way), knots)
         every = np.flatnonzero(again)
-        curve = self._ways_of(every).refine(knots, stays=True)
+        curve = self._ways_of(every).with_knots(knots, stays=True)
         powers = max(x.pieces.shape[-1] for x in (curve, way))
         pieces = pad(curve.pieces, powers)
         pieces[:, np.isin(every, who)] = pad(way.pieces, powers)

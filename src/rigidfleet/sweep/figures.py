@@ -91,7 +91,7 @@ def plot(
     draw: dict[str, Callable[[Table], Figure | None]] = {
         "histograms": histograms,
         "envelopes": metrics_over_drivers,
-        "outcome": success_figure,
+        "outcome": success_over_runs,
         "drivers": correlations,
         "map": partial(map_over_two, over=over, metric=metric),
     }
@@ -106,12 +106,12 @@ def plot(
     return files
 
 
-def success_figure(table: Table) -> Figure | None:
+def success_over_runs(table: Table) -> Figure | None:
     """Success rate over the number of runs, with its confidence interval, and the failures of each check."""
     if not len(table.run):
         return None
     reasons = failure_counts(table.reason)
-    fig = _empty_titled_figure(table, "Outcome", st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6))
+    fig = _titled_figure(table, "Outcome", st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6))
     left, right = fig.subplots(1, 2, width_ratios=(3, 2))
     n = np.unique(np.geomspace(1, len(table.run), 200).astype(int))
     passed = np.cumsum(table.passed)[n - 1]
@@ -290,7 +290,7 @@ def correlations(table: Table) -> Figure | None:
         if d.varied in rows:
             values[rows.index(d.varied), columns.index(d.outcome)] = d.correlation
     title = "What drives success and the metrics"
-    fig = _empty_titled_figure(table, title, st.WIDTH, 2.2 + 0.27 * len(rows))
+    fig = _titled_figure(table, title, st.WIDTH, 2.2 + 0.27 * len(rows))
     ax = fig.subplots()
     image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1, aspect="auto")
     names = [c.replace("_", " ") for c in columns]
@@ -356,7 +356,7 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
         if len(inside):
             cells[i, j] = inside.mean() if metric == "success" else np.median(inside)
     title = "Success rate" if metric == "success" else f"Median: {metric.replace('_', ' ')}"
-    fig = _empty_titled_figure(table, title, 0.75 * st.WIDTH, 0.58 * st.WIDTH)
+    fig = _titled_figure(table, title, 0.75 * st.WIDTH, 0.58 * st.WIDTH)
     ax = fig.subplots()
     wide = metric != "success" and _axis_scale(cells[np.isfinite(cells)]) == "log"
     look: dict[str, Any] = {"vmin": 0, "vmax": 100} if metric == "success" else {}
@@ -380,7 +380,7 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
 # -- parts -------------------------------------------------------------------------------------------
 
 
-def _empty_titled_figure(table: Table, title: str, wide: float, high: float) -> Figure:
+def _titled_figure(table: Table, title: str, wide: float, high: float) -> Figure:
     """A figure of a size [in], with its title and what the sweep is."""
     fig = st.blank_figure(wide, high, "constrained")
     of = "" if table.complete else f" of {table.sweep.runs}"
@@ -395,7 +395,7 @@ def _axes_for_metrics(
     """Figure with small axes, one for each metric, in rows of a height [in]."""
     columns = min(_COLUMNS, max(2, len(names)))
     rows = -(-len(names) // columns)
-    fig = _empty_titled_figure(table, title, st.WIDTH, 0.9 + high * rows)
+    fig = _titled_figure(table, title, st.WIDTH, 0.9 + high * rows)
     axes = fig.subplots(rows, columns, squeeze=False).ravel().tolist()
     for ax in axes[len(names) :]:
         ax.set_visible(False)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet.assessment.fits import fit_samples
+from rigidfleet.assessment.fits import fits_by_sample
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission
 from rigidfleet.mission.bounds import LENGTH, SPEED
@@ -51,7 +51,7 @@ def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     out = list(refused)
     r[out], v[out] = sweep.mission.agents.position, sweep.mission.agents.velocity
     ensemble = establish(sweep.mission, r, v)
-    wrong, metrics = _judge_states(sweep.mission, ensemble)
+    wrong, metrics = _failures_and_metrics(sweep.mission, ensemble)
     failed = {"complete": ~ensemble.finished} | {k: ensemble.finished & x for k, x in wrong.items()}
     wall = (perf_counter() - begun) / len(runs)
     rows = []
@@ -98,7 +98,9 @@ def _invalid_runs(
     return refusals
 
 
-def _judge_states(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict[str, Floats]]:
+def _failures_and_metrics(
+    mission: Mission, flown: Ensemble
+) -> tuple[dict[str, Bools], dict[str, Floats]]:
     """Failed checks (B,) and metrics (B,), by name."""
     count = len(flown.finished)
     wrong = {name: np.zeros(count, dtype=bool) for name in ("distances", "shape", "handedness")}
@@ -127,7 +129,7 @@ def _judge_states(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], 
         slots = mission.formation_slots(formation)
         if slots is None or len(slots) < 2:
             continue
-        fits = [*fit_samples(r, slots, np.arange(len(slots)), allowed)]
+        fits = [*fits_by_sample(r, slots, np.arange(len(slots)), allowed)]
         metrics["shape_end"] = error = np.array([fit.error for fit in fits])
         metrics["shape"] = np.fmax(metrics["shape"], error)
         misshapen = error > fits[0].limit

@@ -112,7 +112,7 @@ def _greatest_known(values: Iterable[float | None]) -> float:
 def _shape_and_tracking_errors(result: Result) -> dict[str, float]:
     """Errors of shape and of tracking at all samples, lost vehicles left out."""
     off = np.ascontiguousarray((_flying_positions(result) - result.slot_position).T)
-    apart, shape = _greatest_of_columns(proximity.root_of_squares(off)), shape_errors(result)
+    apart, shape = _column_maxima(proximity.root_of_squares(off)), shape_errors(result)
     tracked = np.isfinite(apart)
     errors = {
         ("shape_flight", "shape_rms"): shape,
@@ -133,7 +133,7 @@ def shape_errors(result: Result) -> Floats:
 
     Elsewhere, and with many agents, it is that of the edges against their references. NaN if there are none.
     """
-    error = _greatest_of_columns(np.abs(np.ascontiguousarray(result.constraint.T)))
+    error = _column_maxima(np.abs(np.ascontiguousarray(result.constraint.T)))
     n = result.position.shape[1]
     if n < 2 or n > _PAIRED:
         return error
@@ -143,7 +143,7 @@ def shape_errors(result: Result) -> Floats:
         for x in (_flying_positions(result), result.slot_position)
     )
     flown -= due
-    return np.fmax(error, _greatest_of_columns(np.abs(flown, out=flown)))
+    return np.fmax(error, _column_maxima(np.abs(flown, out=flown)))
 
 
 def _flying_positions(result: Result) -> Floats:
@@ -152,6 +152,6 @@ def _flying_positions(result: Result) -> Floats:
     return result.position if left.all() else np.where(left[..., None], result.position, np.nan)
 
 
-def _greatest_of_columns(values: Floats) -> Floats:
+def _column_maxima(values: Floats) -> Floats:
     """Greatest finite value (K,) of each column of values (M, K); NaN if there is none."""
     return np.fmax.reduce(values, axis=0, initial=np.nan)

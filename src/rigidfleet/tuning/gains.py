@@ -20,8 +20,8 @@ from rigidfleet.mission.files import lines_with_digests
 from rigidfleet.mission.schema import Tracking
 from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.timing import complete_times
-from rigidfleet.planning.vehicles import vehicle_lags
-from rigidfleet.preflight.margins import ClosedLoops, formation_closed_loops, tracking_closed_loops
+from rigidfleet.planning.vehicles import lags_by_vehicle
+from rigidfleet.preflight.margins import ClosedLoops, loops_and_omission, tracking_closed_loops
 from rigidfleet.typing import Floats
 
 #: A gain by its path in the mission, as in a variation.
@@ -109,12 +109,12 @@ class Screen:
         mission = complete_times(mission)
         self.mission, self.share = mission, share
         self.gains = own_gains(mission)
-        lags = vehicle_lags(mission)
+        lags = lags_by_vehicle(mission)
         laws: list[tuple[str, ClosedLoops]] = []
         if lags:
             tracking = tracking_closed_loops(mission, lags)
             laws += [] if tracking is None else [(TRACKING, tracking)]
-            looped, _ = formation_closed_loops(mission, preview_phases(mission)[0], lags)
+            looped, _ = loops_and_omission(mission, preview_phases(mission)[0], lags)
             laws += [(CONSTRAINT, law) for law in looped]
         self.parts = _distinct_loop_parts(laws)
         self.own = self.margins_by_law(self.gains)

@@ -189,7 +189,7 @@ def _seed_paths(mission: Mission) -> list[str]:
     return [f"{name}.seed" for name, acts in acting.items() if acts]
 
 
-def _flown_of_candidates(table: Table, candidates: Sequence[Gains], seeds: int) -> list[Flown]:
+def _outcomes_from_table(table: Table, candidates: Sequence[Gains], seeds: int) -> list[Flown]:
     """What was measured of each candidate; its flights are consecutive runs."""
     measurements = []
     for k, gains in enumerate(candidates):
@@ -317,7 +317,7 @@ class _Study:
         self.before, self.now = self.before + self.now, self.now * 0
         if not self.rounds and np.median(table.wall) * self.total < WORTH:
             self.count = 1
-        return _flown_of_candidates(table, candidates, len(seeds))
+        return _outcomes_from_table(table, candidates, len(seeds))
 
     def _report_progress(self, now: SweepProgress) -> None:
         self.now = np.array([now.done, now.flown, now.failed])

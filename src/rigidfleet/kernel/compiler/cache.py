@@ -72,7 +72,7 @@ def _cache_digest() -> str:
 
 
 @contextmanager
-def open_safely(file: str | Path) -> Generator[IO[bytes]]:
+def open_for_reading(file: str | Path) -> Generator[IO[bytes]]:
     """Open a file of the cache for reading: exactly the file that was checked, even if its name is changed meanwhile.
 
     Raises

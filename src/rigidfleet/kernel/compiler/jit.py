@@ -23,7 +23,7 @@ from numba.core.caching import (
 from numba.core.ccallback import CFunc
 
 from rigidfleet._common.files import replace_atomically
-from rigidfleet.kernel.compiler.cache import cache_directory, open_safely, warn_not_cached
+from rigidfleet.kernel.compiler.cache import cache_directory, open_for_reading, warn_not_cached
 from rigidfleet.kernel.compiler.levels import (
     KEY,
     runnable_instruction_level,
@@ -132,13 +132,13 @@ class _Files(IndexDataCacheFile):
 
     def _load_index(self) -> Any:
         try:
-            with open_safely(self._index_path):
+            with open_for_reading(self._index_path):
                 return super()._load_index()
         except OSError:
             return {}
 
     def _load_data(self, name: str) -> Any:
-        with open_safely(self._data_path(name)):
+        with open_for_reading(self._data_path(name)):
             return super()._load_data(name)
 
     def _open_for_write(self, filepath: str) -> Any:

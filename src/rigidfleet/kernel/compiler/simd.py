@@ -73,14 +73,14 @@ _KIND = np.dtype((np.void, WIDTH * 8))
 
 
 class LaneArray(np.ndarray):
-    """An array of `lanes`, made by `pack` and read by `unpack`."""
+    """An array of `lanes`, made by `pack_lanes` and read by `unpack_lanes`."""
 
 
 def pack_lanes(values: Floats) -> LaneArray:
     """An array (...) of lanes from float64 (..., 8): a copy, aligned for vectors."""
     values = np.asarray(values, dtype=np.float64)
     packed = empty_lanes(values.shape[:-1])
-    unpack(packed)[...] = values
+    unpack_lanes(packed)[...] = values
     return packed
 
 
@@ -92,7 +92,7 @@ def empty_lanes(shape: tuple[int, ...]) -> LaneArray:
     return memory[skip : skip + size].view(_KIND).reshape(shape).view(LaneArray)
 
 
-def unpack(array: NDArray[Any]) -> Floats:
+def unpack_lanes(array: NDArray[Any]) -> Floats:
     """View an array (...) of lanes as float64 (..., 8)."""
     plain = array.view(np.ndarray)
     return plain.reshape(plain.shape + (1,)).view(np.float64)
@@ -340,12 +340,12 @@ def _reduce_lanes(_context, x, largest):
     return types.float64(x, types.boolean), generate
 
 
-def one_flight_sum_or_worst(x, states):
+def sum_lanes_or_worst(x, states):
     """Sum over the lanes of x if ``states`` belong to one flight; otherwise the value of the worst flight."""
     raise NotImplementedError("compiled code only")
 
 
-@overload(one_flight_sum_or_worst)
+@overload(sum_lanes_or_worst)
 def _overload_lane_sum_or_worst(x, states):
     if states.dtype == lanes:
         return lambda x, states: _reduce_lanes(x, True)

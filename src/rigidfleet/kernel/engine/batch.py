@@ -13,7 +13,7 @@ from rigidfleet._common.arrays import arrays_equal
 from rigidfleet._common.renamed import getattr_of_earlier_names
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.compiler.pointers import address_of
-from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, empty_lanes, pack_lanes, unpack
+from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, empty_lanes, pack_lanes, unpack_lanes
 from rigidfleet.kernel.engine import lane_steps, native
 from rigidfleet.kernel.engine.codegen import (
     addresses,
@@ -208,8 +208,10 @@ class Vector:
             samples=addresses(samples), trails=np.array(trails), halves=empty_lanes((2, 5, n))
         )
         K = empty_lanes((lane_steps.ROWS, n))
-        unpack(K)[: lane_steps.STAGES] = 0.0
-        unpack(K)[lane_steps.ATOL] = np.stack([state.K[ATOL, :n] for state in states], axis=-1)
+        unpack_lanes(K)[: lane_steps.STAGES] = 0.0
+        unpack_lanes(K)[lane_steps.ATOL] = np.stack(
+            [state.K[ATOL, :n] for state in states], axis=-1
+        )
         clock = np.array([first.clock[TIME], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
         y, count = packed([state.y for state in states]), np.zeros_like(first.count)
         trail = NO_TRAIL._replace(clock=np.empty((rows, 2)), gauge=np.empty((0, forces)))
@@ -227,7 +229,7 @@ class Vector:
             self._problem, state, self._t_end, self._fresh, self._times, _UNSAMPLED, max_steps
         )
         self._fresh = False
-        y = unpack(state.y)
+        y = unpack_lanes(state.y)
         for lane, own in enumerate(self._states):
             own.y[:] = y[:, lane]
             own.clock[:], own.count[:] = state.clock, state.count
@@ -320,7 +322,7 @@ def fly_all(
         return fly_range
 
     ends = _fly_in_threads(make_vector_worker, in_lanes(starts), in_lanes(before), threads)
-    y = unpack(ends.y).swapaxes(1, 2).reshape(-1, n)[:count]
+    y = unpack_lanes(ends.y).swapaxes(1, 2).reshape(-1, n)[:count]
     finished = np.repeat(ends.finished, WIDTH)[:count]
     evaluations = np.repeat(ends.evaluations, WIDTH)[:count]
     lost = ~finished

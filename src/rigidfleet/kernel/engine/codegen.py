@@ -20,7 +20,7 @@ from numba.extending import intrinsic
 from rigidfleet.kernel import dopri5
 from rigidfleet.kernel.compiler import simd
 from rigidfleet.kernel.compiler.jit import compiled_copy, compiled_for_c, jit_inline
-from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, unpack
+from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, unpack_lanes
 from rigidfleet.kernel.disturbances import spline_weights
 from rigidfleet.kernel.engine import lane_steps
 from rigidfleet.kernel.engine.tracer import (
@@ -97,7 +97,7 @@ def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> Un
     if turns.any():  # slots that do not turn, where others do
         values[TURN, ~turns] = _BARELY
     motion = packed([p.motion.coefficients.reshape(-1, 36) for p in problems])
-    sizes = np.abs(unpack(motion)).reshape(-1, 6, 6 * WIDTH).max(axis=(0, 2))
+    sizes = np.abs(unpack_lanes(motion)).reshape(-1, 6, 6 * WIDTH).max(axis=(0, 2))
     moves = (sizes > _STILL).tolist()
     description = flight_code_structure(first, values, moves)
     ready = _prepare_unrolled(first, description, values, lambda: FlightTrace(first, values, moves))
@@ -271,7 +271,7 @@ def _compile_flight_constants(code: Code, name: str) -> Callable[[int, int], Non
     """Compile what is known before a flight: a function of the addresses of numbers (D,) and inputs (U,), in lanes."""
 
     @intrinsic
-    def flight_constants_intrinsic(_context, source, uniform):
+    def write_constants_intrinsic(_context, source, uniform):
         def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
             numbers, inputs = arguments
             load = lambda b, x: b.load(_element_address(b, numbers, x.arguments[0]), align=8)  # noqa: E731
@@ -288,7 +288,7 @@ def _compile_flight_constants(code: Code, name: str) -> Callable[[int, int], Non
         _compute_before_flight,
         f"before_{name}",
         arguments=2,
-        _write_flight_constants=flight_constants_intrinsic,
+        _write_flight_constants=write_constants_intrinsic,
     )
     return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address)
 

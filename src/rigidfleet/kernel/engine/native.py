@@ -22,7 +22,7 @@ import numpy as np
 from rigidfleet._common.files import replace_atomically
 from rigidfleet.kernel.compiler.cache import (
     cache_directory,
-    open_safely,
+    open_for_reading,
     sources_digest,
     warn_not_cached,
 )
@@ -281,7 +281,7 @@ def _cache_file(part: str) -> Path:
 def _read_cached_code(part: str) -> list[bytes] | None:
     """Machine code from the cache, if there is any that is safe to run."""
     try:
-        with open_safely(_cache_file(part)) as stream:
+        with open_for_reading(_cache_file(part)) as stream:
             return split_object_codes(stream.read())
     except OSError:
         return None

@@ -33,7 +33,7 @@ ENTRIES = {
     "large": dict.fromkeys(
         (
             "solve", "multipliers", "elimination_tree", "count_factor_blocks", "list_factor_blocks", "assemble",
-            "factor", "apply_J", "apply_Jt", "inner", "project_on_past_solutions",
+            "factor", "add_J_product", "add_Jt_product", "inner", "project_on_past_solutions",
             "conjugate_gradients", "conjugate_gradients_single",
         ), 1
     ),

@@ -63,7 +63,7 @@ class Packed(NamedTuple):
 _buffer = (ctypes.c_char * 0).from_buffer
 
 
-def _tuple_words(x: Any) -> tuple[Any, list[Any], list[Any]]:
+def _kinds_and_words(x: Any) -> tuple[Any, list[Any], list[Any]]:
     """A named tuple, the kinds of its numbers and arrays, and its words."""
     kinds: list[Any] = []
     words: list[Any] = []
@@ -81,7 +81,7 @@ def _tuple_words(x: Any) -> tuple[Any, list[Any], list[Any]]:
             words.append(value)
             kinds.append(float)
         elif isinstance(value, tuple):
-            _, own, inside = _memoise_last(_tuple_words, value)
+            _, own, inside = _memoise_last(_kinds_and_words, value)
             kinds += own
             words += inside
         else:
@@ -98,7 +98,7 @@ def pack_uncached(x: Any) -> Packed:
     TypeError
         Numbers or arrays are not of the types that the kernel is compiled for.
     """
-    _, kinds, values = _tuple_words(x)
+    _, kinds, values = _kinds_and_words(x)
     expected, code = _word_layout(type(x))
     if kinds != expected:
         raise TypeError(
@@ -145,7 +145,7 @@ def forget_last_packed() -> None:
 @cache
 def _word_layout(kind: type) -> tuple[list[Any], struct.Struct]:
     """Kinds of the numbers and arrays of a type of named tuple, and how its words are stored."""
-    _, kinds, words = _tuple_words(example_of(kind))
+    _, kinds, words = _kinds_and_words(example_of(kind))
     return kinds, struct.Struct("=" + "".join("d" if type(x) is float else "q" for x in words))
 
 
@@ -231,8 +231,8 @@ def _large_solver_examples() -> tuple[Any, ...]:
         "list_factor_blocks": tree | {"free": k, "out": Pattern(*(k,) * 7)},
         "assemble": matrix | {"place": k, "column": k, "of_edge": k, "L": blocks},
         "factor": rows | {"L": blocks, "at": k},
-        "apply_J": {"u": a, "edges": edges, "a": a, "scale": 1.0, "out": b},
-        "apply_Jt": {"u": a, "edges": edges, "b": b, "scale": 1.0, "out": a},
+        "add_J_product": {"u": a, "edges": edges, "a": a, "scale": 1.0, "out": b},
+        "add_Jt_product": {"u": a, "edges": edges, "b": b, "scale": 1.0, "out": a},
         "inner": {"a": a, "b": a},
         "project_on_past_solutions": matrix | {"g": a, "past": many, "gram": frame, "x": a},
         "conjugate_gradients": gradients,

@@ -144,12 +144,12 @@ class LargeSolver:
             if not self.pulled:
                 return
             self.counts.fallbacks += 1
-        if not np.isfinite(w.b).all() or not self._solve_at_agents():
+        if not np.isfinite(w.b).all() or not self._iterate_at_agents():
             self.counts.failures += 1
             self._fill_results_with_nan()
         elif order is not None:
             w.f_C[:] = 0.0
-            call_large("apply_Jt", w.u, self.edges, w.multiplier, 1.0, w.f_C)
+            call_large("add_Jt_product", w.u, self.edges, w.multiplier, 1.0, w.f_C)
 
     def find_multipliers(self) -> None:
         """Find the multipliers of the last evaluation, if elimination has not found them yet."""
@@ -159,7 +159,7 @@ class LargeSolver:
             self.a[:] = w.f_C
             call_large("multipliers", w.u, order, self.a, w.multiplier)
 
-    def _solve_at_agents(self) -> bool:
+    def _iterate_at_agents(self) -> bool:
         """Iterated Tikhonov in the agents' coordinates, see `constraint.solve_at_agents`.
 
         The exact law uses the same solve with almost no damping. Its multipliers would be differences of large
@@ -177,22 +177,22 @@ class LargeSolver:
         iterated = self.law.solver == ITERATED
         for k in range(self.iterations):
             self.g[:] = 0.0
-            call_large("apply_Jt", w.u, edges, self.rest, self.mbar, self.g)
+            call_large("add_Jt_product", w.u, edges, self.rest, self.mbar, self.g)
             x = self._solve_system(k)
             if x is None:
                 return False
-            call_large("apply_J", w.u, edges, x, -1.0, self.rest)
+            call_large("add_J_product", w.u, edges, x, -1.0, self.rest)
             if iterated:
                 y += (self.mbar / self.mu) * self.rest
             else:
                 a += x
         for k in range(0 if iterated else self.iterations):
             self.g[:] = m[:, None] * a
-            call_large("apply_Jt", w.u, edges, y, -1.0, self.g)
+            call_large("add_Jt_product", w.u, edges, y, -1.0, self.g)
             x = self._solve_system(self.iterations + k)
             if x is None:
                 return False
-            call_large("apply_J", w.u, edges, x, self.mbar, y)
+            call_large("add_J_product", w.u, edges, x, self.mbar, y)
         return True
 
     def _prepare_factor(self) -> None:

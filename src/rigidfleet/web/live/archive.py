@@ -38,9 +38,9 @@ class Archive:
             key = piece.phase, len(piece.edges)
             kept, keep = self.phases.setdefault(key, []), self._is_multiple(piece.time)
             keep[0] |= key not in self.ends  # the start
-            self.ends[key] = select_rows(piece, [-1])
+            self.ends[key] = take_samples(piece, [-1])
             if keep.any():
-                kept.append(select_rows(piece, keep))
+                kept.append(take_samples(piece, keep))
                 self.size += _count_values(kept[-1])
             if len(kept) >= _JOINED and len(kept[-1].time) < _JOINED:
                 kept[:] = [_join_pieces(kept)]
@@ -52,7 +52,7 @@ class Archive:
         pieces = []
         for key, kept in self.phases.items():
             every = _join_pieces([*kept, self.ends[key]])
-            pieces.append(select_rows(every, np.unique(every.time, return_index=True)[1].tolist()))
+            pieces.append(take_samples(every, np.unique(every.time, return_index=True)[1].tolist()))
         return pieces
 
     def _is_multiple(self, time: Floats) -> Bools:
@@ -67,7 +67,7 @@ class Archive:
             whole = _join_pieces(kept)
             keep = self._is_multiple(whole.time)
             keep[0] = True  # the start
-            kept[:] = [select_rows(whole, keep)]
+            kept[:] = [take_samples(whole, keep)]
         self.size = sum(_count_values(kept[0]) for kept in self.phases.values())
         self.most = max(self.most, 2.0 * self.size if self.size > 0.5 * self.most else 0.0)
 
@@ -77,7 +77,7 @@ def _count_values(piece: Piece) -> int:
     return sum(x.size for x in piece.forces_and_references)
 
 
-def select_rows(piece: Piece, which: Bools | list[int]) -> Piece:
+def take_samples(piece: Piece, which: Bools | list[int]) -> Piece:
     """Some samples of a piece."""
     return _combine_arrays([piece], lambda x: x[0][which])
 

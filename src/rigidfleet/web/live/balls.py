@@ -44,7 +44,7 @@ class Ball:
         """Its name in messages and in the record."""
         return f"ball {self.number}"
 
-    def follow_goal(self) -> None:
+    def steer_to_goal(self) -> None:
         """Choose the velocity of the next tick; a ball that is drawn follows its goal."""
         if self.goal is None:
             return

@@ -23,7 +23,7 @@ from rigidfleet.simulation.flight import Flight
 from rigidfleet.simulation.recording import assemble_result
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.live import balls
-from rigidfleet.web.live.archive import Archive, select_rows
+from rigidfleet.web.live.archive import Archive, take_samples
 from rigidfleet.web.live.balls import Ball
 
 TICK = 0.05  # time between readings of the user's commands [s]
@@ -176,7 +176,9 @@ class Pilot:
         far = float(np.linalg.norm(slots - before, axis=1).max())
         share = np.linspace(0.0, 1.0, math.ceil(far / _LOOK) + 2)[1:, None, None]
         way = before + share * (slots - before)  # straight and in step
-        room, agent, which = self._clearances(way, self.target.r[None, None], self.target.attitude)
+        room, agent, which = self._obstacle_clearance(
+            way, self.target.r[None, None], self.target.attitude
+        )
         k = int(room.argmin())
         if formation != self.formation and room[k] < 0.0:
             name = self.at_rest[which[k]].name
@@ -290,7 +292,7 @@ class Pilot:
                 name = flight.mission.obstacles[met.other].name
                 flight.ending = f"agent {met.who + 1} met '{name}' at {met.time:.2f} s"
         if flight.pieces or self.last is None:
-            end = [select_rows(flight.pieces[-1], [-1])] if flight.pieces else []
+            end = [take_samples(flight.pieces[-1], [-1])] if flight.pieces else []
             # A record of one moment has no extremes
             phases = [replace(p, extremes={}) for p in self.flight.phases]
             now: dict[str, Any] = {"ending": "", "statistics": {}, "network": flight.network}
@@ -367,8 +369,8 @@ class Pilot:
         if self.t - target.held <= _GRIP:
             self._move_target(h)
         away = att.rotation_vector_from_dcm(target.attitude @ pose.T.T)  # body axes
-        r, v, a = _step_towards(target.r - pose.r, pose.v, self.a, h, _ACCELERATION)
-        phi, omega, alpha = _step_towards(away, pose.omega, self.alpha, h, _TURN)
+        r, v, a = _displacement_towards(target.r - pose.r, pose.v, self.a, h, _ACCELERATION)
+        phi, omega, alpha = _displacement_towards(away, pose.omega, self.alpha, h, _TURN)
         if self.commanded[-1].control != "open":
             places = self._positions() if self.gusts else np.zeros((0, 3))
             self.gusts = [gust for gust in self.gusts if not gust.has_passed(self.t, places)]
@@ -382,12 +384,12 @@ class Pilot:
     def _move_target(self, h: float) -> None:
         """Move and turn the target as commanded, but no slot deeper into an obstacle or the ground."""
         target, slots = self.target, self._slots
-        room, _, _ = self._clearances(slots, target.r[None, None], target.attitude)
+        room, _, _ = self._obstacle_clearance(slots, target.r[None, None], target.attitude)
         least = min(float(room[0]), 0.0)
 
         def blocking_obstacle_name(path: Floats, attitude: Floats) -> str:
             """What a slot would be deeper in somewhere on a path (K, 3), "" for nothing."""
-            after, _, which = self._clearances(slots, path[:, None], attitude)
+            after, _, which = self._obstacle_clearance(slots, path[:, None], attitude)
             return "" if (after >= least).all() else self.at_rest[which[int(after.argmin())]].name
 
         turned = target.euler + h * target.turn
@@ -417,7 +419,7 @@ class Pilot:
         assert slots is not None  # every formation flown has slots
         return slots
 
-    def _clearances(self, slots: Floats, r: Floats, T: Floats) -> tuple[Floats, Ints, Ints]:
+    def _obstacle_clearance(self, slots: Floats, r: Floats, T: Floats) -> tuple[Floats, Ints, Ints]:
         """Least room (K,) [m] of slots (N, 3) or (K, N, 3) beside obstacles at rest, agent and obstacle (K,).
 
         The body is at r (K or 1, 1, 3), in an attitude T (3, 3).
@@ -429,7 +431,7 @@ class Pilot:
     def _update_obstacles(self) -> None:
         """Tell the flight of balls that are new, gone, or fly another way."""
         for ball in self.flying_balls:
-            ball.follow_goal()
+            ball.steer_to_goal()
             if ball.changed:
                 ball.note_way_corner(self.t)
                 self.moved = True
@@ -447,7 +449,7 @@ class Pilot:
         return sum((gust.force(t, r, self.masses) for gust in self.gusts), np.zeros_like(r))
 
 
-def _step_towards(
+def _displacement_towards(
     away: Floats, v: Floats, a: Floats, h: float, most: float
 ) -> tuple[Floats, Floats, Floats]:
     """Displacement over h [s], and final velocity and acceleration, of a reference drawn to a point ``away``.
