@@ -175,7 +175,7 @@ def by_quadrotors(models: list[str], *, lost: int | None = None) -> Result:
     q = np.stack([np.cos(tilt / 2), np.sin(tilt / 2), 0 * tilt, 0 * tilt], axis=2)
     vehicles = Mission.from_toml(bare.mission_text).vehicle_models
     assert vehicles is not None
-    limit = np.array([model.rotor_limit for model in vehicles])
+    limit = np.array([model.rotor_thrust_limit for model in vehicles])
     force = 0.3 * np.broadcast_to(limit[:, None], (len(t), n, 4)).copy()
     force[:, who, who % 4] += 0.1 * who * limit * wave[:, None]
     busy = (t[:, None] > 8.0) & (t[:, None] < 9.0) & (who == 1)

@@ -46,7 +46,7 @@ def test_models_can_fly(name):
 def test_the_paper_gives_mass_and_thrust():
     """The paper's vehicle has a kilogram and four rotors of 5.9 N; what the paper leaves open is marked as chosen."""
     model = model_of_vehicle(Vehicle(model="paper"))
-    assert (model.mass, model.rotor_limit) == (1.0, pytest.approx(5.9))
+    assert (model.mass, model.rotor_thrust_limit) == (1.0, pytest.approx(5.9))
     chosen = {key for key, (_, source) in MODELS["paper"].items() if source.startswith("chosen")}
     assert chosen == set(MODELS["paper"]) - {"mass", "thrust_coefficient"}
 

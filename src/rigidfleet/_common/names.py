@@ -219,8 +219,8 @@ def meanings_of(names: Sequence[str]) -> list[ColumnMeaning]:
     return [q._replace(kind=up.get(q.kind, q.kind)) for q in kinds]
 
 
-def count_column_names(names: Sequence[str]) -> int:
-    """How many of a line's fields are names of columns; 0 if it has no place and nothing else besides."""
-    kinds = [q.kind for q in meanings_of(names) if q.kind]
+def count_column_names(fields: Sequence[str]) -> int:
+    """How many of a line's ``fields`` are names of columns; 0 if it has no place and nothing else besides."""
+    kinds = [q.kind for q in meanings_of(fields) if q.kind]
     places = {*DIRECTIONS, "x", "y", "latitude", "x^0"}
     return len(kinds) if len(kinds) > 1 and places & {*kinds} else 0

@@ -161,7 +161,7 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity("thrust_margin", "N", "greatest thrust minus its limit", checked=False),
         Quantity(
             "rotor_force", "N", "force of the rotor that comes nearest to its limit", monitored=False,
-            limit=lambda m: [v.rotor_limit for v in m.vehicle_models or ()], nothing="flown by points",
+            limit=lambda m: [v.rotor_thrust_limit for v in m.vehicle_models or ()], nothing="flown by points",
         ),
         Quantity(
             "saturation", "%", "greatest share of a phase in which a vehicle is asked for more than its rotors give",

@@ -245,13 +245,13 @@ def matrix_to_enu(axes: str) -> Floats:
     return turn
 
 
-def is_number(field: str) -> bool:
-    """Whether a field is a number, with a decimal point or comma; "nan" and "inf" are."""
+def is_number(text: str) -> bool:
+    """Whether a text is a number, with a decimal point or comma; "nan" and "inf" are."""
     try:
-        float(field)
+        float(text)
     except ValueError:
-        return _COMMA.fullmatch(field.strip()) is not None
-    return "_" not in field
+        return _COMMA.fullmatch(text.strip()) is not None
+    return "_" not in text
 
 
 def split_fields(line: str, separator: str) -> list[str]:

@@ -69,17 +69,17 @@ class Alignment(NamedTuple):
         }  # fmt: skip
 
 
-def fit_alignment(logs: Logs, plan: Plan, clock: str) -> Alignment:
+def fit_alignment(logs: Logs, plan: Plan, clock_mode: str) -> Alignment:
     """The clock and the set-up of logs against a plan.
 
-    ``clock``: "recorded", near that of the plan; "offset", anywhere; or "own", each log anywhere for itself
+    ``clock_mode``: "recorded", near that of the plan; "offset", anywhere; or "own", each log anywhere for itself
     """
     logs = [(t[:: -(-len(t) // _MANY)], x[:: -(-len(t) // _MANY)]) for t, x in logs]
     start, apart = np.zeros(6), np.zeros(len(logs))
-    if clock == "own":
+    if clock_mode == "own":
         apart[:] = [_best_clock_offset([log], [way]) for log, way in zip(logs, plan, strict=True)]
         logs = [(t - by, x) for (t, x), by in zip(logs, apart, strict=True)]
-    start[0] = _best_clock_offset(logs, plan) if clock == "offset" else 0.0
+    start[0] = _best_clock_offset(logs, plan) if clock_mode == "offset" else 0.0
     every = np.ones(6, dtype=np.bool_)
     whole, errors, left = _fit(logs, plan, start, every, _mse_and_setup(logs, plan, start[0])[1])
     own = np.empty((2, len(logs)))

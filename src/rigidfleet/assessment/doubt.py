@@ -128,8 +128,8 @@ def _norms(x: Floats) -> Floats:
     return np.sqrt(np.einsum("...a,...a->...", x, x))
 
 
-def _estimate_greatest_norm(x: Floats) -> float:
-    return _estimate_greatest(_norms(x))
+def _estimate_greatest_norm(draws: Floats) -> float:
+    return _estimate_greatest(_norms(draws))
 
 
 def _estimate_greatest(sizes: Floats) -> float:
@@ -154,7 +154,7 @@ def _is_of_pairs(name: str) -> bool:
 
 
 def verdict_with_intervals(
-    verdict: Verdict, deviations: DrawnWays | None, facts: dict[str, Any], *, shared: bool
+    verdict: Verdict, deviations: DrawnWays | None, facts: dict[str, Any], *, common_clock: bool
 ) -> Verdict:
     """A verdict with intervals.
 
@@ -163,12 +163,12 @@ def verdict_with_intervals(
     verdict : on the likely flight
     deviations : of ways drawn; None: the noise is not known, and nothing with a limit is decided
     facts : what is told of noise, clock, set-up and vehicles
-    shared : whether all vehicles have one clock
+    common_clock : whether all vehicles have one clock
     """
     checks, resets = [], facts.get("resets_s", [])
     for check in verdict.checks:
         name, why = check.check, "" if deviations else "the noise is not told. State it: --noise"
-        if not shared and _is_of_pairs(name):
+        if not common_clock and _is_of_pairs(name):
             why = "vehicles have no common clock"
             check = replace(check, worst=None, first=None)  # noqa: PLW2901
         if deviations and not why and name not in (*_CERTAIN, *_UNSEEN):

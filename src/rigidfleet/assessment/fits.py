@@ -59,11 +59,11 @@ class Fit(NamedTuple):
 
 
 def fits_by_sample(
-    p: Floats, slots: Floats, who: Ints, greatest_error: Callable[[float], float]
+    p: Floats, slots: Floats, who: Ints, error_limit: Callable[[float], float]
 ) -> Iterator[Fit]:
     """Compare a formation as flown at G samples with its slots (N, 3): agents ``who`` (N,) at p (G, N, 3).
 
-    ``greatest_error``: the one that is allowed [m], of the shortest distance of two slots [m].
+    ``error_limit``: the one that is allowed [m], of the shortest distance of two slots [m].
     """
     dimension, axis, order, shortest = _shape_properties(slots)
     own, centred = p - p.mean(axis=1, keepdims=True), rigid_body.centred(slots)
@@ -80,7 +80,7 @@ def fits_by_sample(
         along = np.linalg.eigh(own.swapaxes(1, 2) @ own)[1][..., -1:]
         flown = (own @ along)[..., 0].argsort(axis=1).tolist()
         in_order = [x in (order, order[::-1]) for x in flown]
-    points, limit = (turn @ axis).tolist(), greatest_error(shortest)
+    points, limit = (turn @ axis).tolist(), error_limit(shortest)
     for wrong, right, place, ordered in zip(worst, proper.tolist(), points, in_order, strict=True):
         error, i, j, apart, intended = wrong
         pair, mirrored = (who.item(i), who.item(j)), dimension == 3 and not right

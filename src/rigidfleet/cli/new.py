@@ -138,7 +138,7 @@ def _text_of_show(file: Path, values: dict[str, Any], formations: str, spacing: 
     )
 
 
-def _formation_of_show(file: Path, word: str, agents: int, spacing: float) -> Any:
+def _formation_of_show(mission_file: Path, shape: str, agents: int, spacing: float) -> Any:
     """A formation of a show of a shape, a file or words.
 
     Points of a whole file in the folder of the mission that are not too narrow are written by the name of the file.
@@ -153,22 +153,22 @@ def _formation_of_show(file: Path, word: str, agents: int, spacing: float) -> An
     from rigidfleet.math import proximity
     from rigidfleet.mission import show_draft
 
-    if word in SHAPES:
-        return show_draft.shape_scene(word, agents, spacing)
-    folder, there, count = file.parent.resolve(), Path(word).resolve(), agents
-    if (own := _points_of_file(word)) is not None:
+    if shape in SHAPES:
+        return show_draft.shape_scene(shape, agents, spacing)
+    folder, there, count = mission_file.parent.resolve(), Path(shape).resolve(), agents
+    if (own := _points_of_file(shape)) is not None:
         whole = not own.notes and len(own.slots) <= agents and there.is_relative_to(folder)
         if whole and spacing <= proximity.nearest(own.slots).min() < math.inf:
             source = there.relative_to(folder).as_posix()
-            return show_draft.points_scene(Path(word).stem, own, source, by_name=True)
+            return show_draft.points_scene(Path(shape).stem, own, source, by_name=True)
         count = min(agents, len(own.slots))
     try:
-        name, points = load_shape_points(word, count, spacing=spacing)
+        name, points = load_shape_points(shape, count, spacing=spacing)
     except ValueError as error:
-        raise ValueError(f"{word}: {error}") from None
+        raise ValueError(f"{shape}: {error}") from None
     for note in points.notes:
-        console.err().print(f"Note: {word}: {note}.", markup=False)
-    return show_draft.points_scene(name, points, word)
+        console.err().print(f"Note: {shape}: {note}.", markup=False)
+    return show_draft.points_scene(name, points, shape)
 
 
 def _points_of_file(word: str) -> Any:

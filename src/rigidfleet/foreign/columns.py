@@ -352,10 +352,10 @@ def _combined_codes(*codes: Ints) -> Ints:
     return np.argsort(np.argsort(first))[inverse]
 
 
-def _time_increases(time: Floats, part: Ints) -> bool:
+def _time_increases(time: Floats, part_of_row: Ints) -> bool:
     """Whether times increase within each part of the rows."""
-    order = np.argsort(part, kind="stable")
-    return bool((np.diff(time[order]) > 0.0)[np.diff(part[order]) == 0].all())
+    order = np.argsort(part_of_row, kind="stable")
+    return bool((np.diff(time[order]) > 0.0)[np.diff(part_of_row[order]) == 0].all())
 
 
 def _length_of_ways(place: Floats, part: Ints) -> float:

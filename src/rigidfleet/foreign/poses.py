@@ -227,22 +227,22 @@ def _message_layout(definition: str, little: bool) -> np.dtype[Any]:
 
 
 def _stamped_positions(
-    kind: str, layout: np.dtype[Any] | None, data: bytes
+    kind: str, layout: np.dtype[Any] | None, message: bytes
 ) -> Iterator[tuple[str, str, int, Sequence[float]]]:
     """Body ("" if the topic is of one), frame, stamp [ns] or 0, and numbers of each position in a message."""
     if layout is not None:
-        if len(data) < 4 + layout.itemsize:
+        if len(message) < 4 + layout.itemsize:
             raise struct.error
-        yield "", "", 0, np.frombuffer(data, layout, 1, 4).item()
+        yield "", "", 0, np.frombuffer(message, layout, 1, 4).item()
         return
-    order, at = "<" if data[1:2] == b"\1" else ">", 4
+    order, at = "<" if message[1:2] == b"\1" else ">", 4
 
     def read(form: str) -> tuple[Any, ...]:
         """Numbers of one size, from their place on."""
         nonlocal at
         size = struct.calcsize(f"={form[-1]}")
         at += -(at - 4) % size
-        values = struct.unpack_from(order + form, data, at)
+        values = struct.unpack_from(order + form, message, at)
         at += size * len(values)
         return values
 
@@ -250,7 +250,7 @@ def _stamped_positions(
         nonlocal at
         (length,) = read("I")
         at += length
-        return bytes(data[at - length : at - 1]).decode(errors="replace")
+        return bytes(message[at - length : at - 1]).decode(errors="replace")
 
     for _ in range(*read("I") if kind == "TFMessage" else (1,)):
         stamp, frame = read("i")[0] * _BILLION + read("I")[0], next_text()

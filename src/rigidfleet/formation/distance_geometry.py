@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.math.rigid_body import centred
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Bools, Floats
 
 #: Relative tolerance within which given distances must be realisable. Flat and straight shapes lie exactly
 #: on the limit, so distances need about seven digits: 5.656854, not 5.657.
@@ -85,14 +85,14 @@ def _cliques(after: dict[int, set[int]], size: int) -> Iterator[tuple[int, ...]]
     return extend((), set(after))
 
 
-def _triangle_excess_and_violations(sides: Floats) -> tuple[Floats, Floats]:
+def _triangle_excess_and_violations(sides: Floats) -> tuple[Floats, Bools]:
     """By how much the longest side of triangles (K, 3) [m] is too long, and where that is no rounding."""
     longest = sides.max(axis=1)
     excess = 2 * longest - sides.sum(axis=1)
     return excess, excess > REALISABLE * longest
 
 
-def _squared_volumes(sides: Floats) -> tuple[Floats, Floats]:
+def _squared_volumes(sides: Floats) -> tuple[Floats, Bools]:
     """Squared volumes of tetrahedra of sides 12, 13, 14, 23, 24, 34 (K, 6) [m], and where they are negative."""
     a, b, c, ab, ac, bc = squares = sides.T**2
     # Gram matrix of the three edges from the first agent, doubled: its determinant is 288 V^2 (Cayley-Menger).
@@ -157,9 +157,9 @@ def _turn_to_slot_convention(p: Floats) -> Floats:
     return out * [1, 1, -1] if handedness(out) < 0 else out
 
 
-def _first_nonzero_direction(vectors: Iterable[Floats], p: Floats) -> Floats | None:
-    """Unit vector along the first of the vectors that is not small relative to the shape p."""
-    small = 1e-6 * np.abs(p).max(initial=0.0)
+def _first_nonzero_direction(vectors: Iterable[Floats], shape: Floats) -> Floats | None:
+    """Unit vector along the first of the vectors that is not small relative to a shape."""
+    small = 1e-6 * np.abs(shape).max(initial=0.0)
     return next((v / np.linalg.norm(v) for v in vectors if np.linalg.norm(v) > small), None)
 
 

@@ -54,10 +54,10 @@ def count_pairs_within(points: ArrayLike, distance: float) -> int:
     return (int(tree.count_neighbors(tree, distance)) - tree.n) // 2
 
 
-def _neighbour_range(points: ArrayLike, reach: float) -> float:
+def _neighbour_range(points: ArrayLike, ratio: float) -> float:
     """Greatest distance [m] between neighbours among points (N, 3); infinite for a single one."""
     p = np.asarray(points, dtype=np.float64)
-    return reach * float(np.median(nearest(p))) * (1 + 1e-9)
+    return ratio * float(np.median(nearest(p))) * (1 + 1e-9)
 
 
 def refuse_flat_shapes(points: ArrayLike) -> None:

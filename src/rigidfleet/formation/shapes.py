@@ -77,8 +77,8 @@ def _two_spheres(size: Floats, n: int) -> Floats:
     def sphere_radius(count: int) -> float:
         return float(np.linalg.norm(_sphere(size, count)[0]))
 
-    def shell_distance(outer: int) -> float:
-        return sphere_radius(outer) - sphere_radius(n - outer)
+    def shell_distance(outer_count: int) -> float:
+        return sphere_radius(outer_count) - sphere_radius(n - outer_count)
 
     numbers = range(n // 2 + 1, n - 3)  # of agents of the outer sphere
     outer = n // 2 + 1 + bisect_left(numbers, size[0], key=shell_distance)

@@ -104,19 +104,19 @@ def _fit_curves_in_rounds(
     # Points are the last axis: arithmetic on long rows is fast.
     wanted = source.at_shares(_CHECKED).transpose(3, 1, 2, 0).reshape(4, len(_CHECKED), -1)
 
-    def pieces_and_errors(who: Ints, i: Ints, j: Ints) -> tuple[Floats, Floats]:
-        """Pieces (M, 4, P) of vehicles (M,) over intervals i to j - 1, and errors as shares of what is allowed."""
-        h = time[j] - time[i]
+    def pieces_and_errors(who: Ints, first: Ints, last: Ints) -> tuple[Floats, Floats]:
+        """Pieces (M, 4, P) of vehicles (M,) from a knot to another one, and errors as shares of what is allowed."""
+        h = time[last] - time[first]
         position, yaw = (
-            hermite_pieces(h, begin[:m, i, who, axes], end[:m, j - 1, who, axes])
+            hermite_pieces(h, begin[:m, first, who, axes], end[:m, last - 1, who, axes])
             for m, axes in ((orders, slice(3)), (2, slice(3, 4)))
         )
         pieces = np.concatenate([position, pad(yaw, 2 * orders)], axis=1)
-        ends = np.cumsum(j - i)
-        starts = ends - (j - i)
-        row = np.repeat(np.arange(len(who)), j - i)
-        k = np.arange(ends[-1]) + (i - starts)[row]
-        x, c = t[:, k] - time[i][row], pieces.T[:, :, None, row]
+        ends = np.cumsum(last - first)
+        starts = ends - (last - first)
+        row = np.repeat(np.arange(len(who)), last - first)
+        k = np.arange(ends[-1]) + (first - starts)[row]
+        x, c = t[:, k] - time[first][row], pieces.T[:, :, None, row]
         off = c[-1] * x
         for power in c[-2:0:-1]:
             off += power

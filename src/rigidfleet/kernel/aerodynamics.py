@@ -50,17 +50,17 @@ def add_downwash(S, vehicles, density, T, out):
 
 
 @jit
-def ground_effect_factor(z, R, span):
+def ground_effect_factor(z, R, spacings):
     """Factor of the thrust at a height z [m] above the ground, for rotors of radius R [m].
 
     Cheeseman and Bennett (1955) for one rotor, extended to the neighbouring rotors at the distance d, the opposite ones
-    at b and the body by Sanchez-Cuevas, Heredia and Ollero (2017, doi 10.1155/2017/1823056); ``span`` is (d, b). Valid
-    above half a radius; below, the value there is used. 1 if R is 0.
+    at b and the body by Sanchez-Cuevas, Heredia and Ollero (2017, doi 10.1155/2017/1823056); ``spacings`` is (d, b).
+    Valid above half a radius; below, the value there is used. 1 if R is 0.
     """
     if R == 0.0:
         return 1.0
     z = max(z, _LEAST_HEIGHT * R)
-    d, b, near = span[0] * span[0], span[1] * span[1], 4.0 * z * z
+    d, b, near = spacings[0] * spacings[0], spacings[1] * spacings[1], 4.0 * z * z
     one = R / (4.0 * z)
     neighbours = 1.0 / math.sqrt((d + near) ** 3) + 0.5 / math.sqrt((2.0 * d + near) ** 3)
     body = 2.0 * _BODY / math.sqrt((b + near) ** 3)

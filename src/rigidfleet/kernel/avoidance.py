@@ -243,14 +243,14 @@ def with_obstacles(avoidance: AvoidanceArrays, solids: Solids) -> AvoidanceArray
     )
 
 
-def _barrier_arrays(n: int, count: int) -> dict[str, Any]:
+def _barrier_arrays(n: int, obstacles: int) -> dict[str, Any]:
     """Arrays whose size depends on the number of obstacles."""
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
-    rows = min(capacity // 2, _BARRIERS * n) + 2 * n * count
+    rows = min(capacity // 2, _BARRIERS * n) + 2 * n * obstacles
     return {
-        "walls": np.zeros((n, count)), "rows": np.zeros((rows, 3), dtype=np.int64), "normals": np.zeros((rows, 3)),
+        "walls": np.zeros((n, obstacles)), "rows": np.zeros((rows, 3), dtype=np.int64), "normals": np.zeros((rows, 3)),
         "missing": np.zeros(rows), "reduced": np.zeros(rows), "push": np.zeros(rows), "most": np.zeros(rows),
-        "last": np.zeros(capacity + 2 * n * count), "pushing": np.zeros(rows, dtype=np.int64),
+        "last": np.zeros(capacity + 2 * n * obstacles), "pushing": np.zeros(rows, dtype=np.int64),
     }  # fmt: skip
 
 
@@ -269,33 +269,33 @@ def _empty_avoidance_record(n: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def needed_gap_acceleration(gap, s, across, B, rate, soft=0.0):
-    """Least second derivative of a distance by a barrier, see `barriers`; ``across``: the part that motion gives.
+def needed_gap_acceleration(gap, gap_rate, centrifugal, B, rate, soft=0.0):
+    """Least second derivative of a distance by a barrier, see `barriers`; ``centrifugal``: the part that motion gives.
 
-    For numbers and arrays: the gap to what is to be kept [m], its rate s, the braking B to reckon with, and the speed
+    For numbers and arrays: the gap to what is to be kept [m], its rate, the braking B to reckon with, and the speed
     below which it fades.
     """
     safe = np.maximum(gap, _NEAREST - 0.5 * soft * soft / B)
     root = np.sqrt(2.0 * B * safe + soft * soft)
-    return -rate * (root - soft + s) - B * s / root - across
+    return -rate * (root - soft + gap_rate) - B * gap_rate / root - centrifugal
 
 
 def _per_agent(x: ArrayLike, n: int) -> Floats:
     return np.ascontiguousarray(np.broadcast_to(np.asarray(x, dtype=float), (n,)))
 
 
-def _coast_coefficients(k: Floats, T: float) -> Floats:
+def _coast_coefficients(drag_rate: Floats, period: float) -> Floats:
     """Coefficients (N, 3) of a motion under a held acceleration and linear drag; see `AvoidanceArrays.coast`."""
-    x = k * T
+    x = drag_rate * period
     E = np.exp(-x)
     small = x < 0.05
-    safe = np.where(small, 1.0, k)
+    safe = np.where(small, 1.0, drag_rate)
     # Where the differences would cancel, the series 1/2 - x/6 + x^2/24 - ...
     series = np.ones_like(x)
     for order in range(12, 0, -1):
         series = 1.0 - x / (order + 2) * series
-    second = np.where(small, 0.5 * T * T * series, (T + np.expm1(-x) / safe) / safe)
-    first = np.where(small, T - k * second, -np.expm1(-x) / safe)
+    second = np.where(small, 0.5 * period * period * series, (period + np.expm1(-x) / safe) / safe)
+    first = np.where(small, period - drag_rate * second, -np.expm1(-x) / safe)
     return np.stack([E, first, second], axis=1)
 
 

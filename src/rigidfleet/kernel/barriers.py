@@ -72,7 +72,7 @@ def weaken_edge_forces(p, w, state, a):
 
 
 @jit
-def add_barrier(count, i, j, entry, n, missing, limit, a):
+def add_barrier(count, i, j, entry, n, missing_accel, limit, a):
     """Add a barrier along n (3,), with its entry of ``last``; returns the number of them.
 
     It changes the acceleration along n by twice ``limit_thrust`` at most.
@@ -82,7 +82,7 @@ def add_barrier(count, i, j, entry, n, missing, limit, a):
         for q in range(3):
             a.normals[count, q] = n[q]
         reduced = 1.0 / (a.inverse[i] + (a.inverse[j] if j >= 0 else 0.0))
-        a.missing[count], a.most[count] = missing, 2.0 * limit * reduced
+        a.missing[count], a.most[count] = missing_accel, 2.0 * limit * reduced
         a.push[count], a.reduced[count] = min(a.last[entry], a.most[count]), reduced
         count += 1
     return count
@@ -250,13 +250,13 @@ def update_edge_pulls(p, w, a):
 
 
 @jit
-def sweep_gauss_seidel(count, p, w, a):
+def sweep_gauss_seidel(barrier_count, p, w, a):
     """Projected Gauss-Seidel: a sweep over all barriers and edges, then some over those that push alone.
 
     Returns the greatest change of the first one [m/s^2].
     """
     first, pushing = 0.0, 0
-    for k in range(count):
+    for k in range(barrier_count):
         first = max(first, enforce_barrier(k, a))
         if a.push[k] > 0.0:
             a.pushing[pushing] = k
@@ -272,10 +272,10 @@ def sweep_gauss_seidel(count, p, w, a):
 
 
 @jit
-def matrix_entry(i, j, n, k, l, m, a):
-    """Entry of A for two rows: unit vectors n and m (3,), vehicles i and j, k and l (-1: none)."""
+def matrix_entry(i, j, n_ij, k, l, n_kl, a):
+    """Entry of A for two rows: unit vectors n_ij and n_kl (3,), vehicles i and j, k and l (-1: none)."""
     value = 0.0
-    dot = n[0] * m[0] + n[1] * m[1] + n[2] * m[2]
+    dot = n_ij[0] * n_kl[0] + n_ij[1] * n_kl[1] + n_ij[2] * n_kl[2]
     if i == k:
         value += dot / a.weight[i]
     elif i == l:
@@ -336,12 +336,12 @@ def solve_active_set(count, p, w, a):
 
 
 @jit
-def pair_and_normal_of_row(row, size, p, w, a):
-    """Vehicles and unit vector of a row of the system: of one of ``size`` barriers, or after these of an edge."""
-    if row < size:
+def pair_and_normal_of_row(row, barriers, p, w, a):
+    """Vehicles and unit vector of a row of the system: of one of the ``barriers``, or after these of an edge."""
+    if row < barriers:
         k = a.active[row]
         return a.rows[k, 0], a.rows[k, 1], a.normals[k]
-    return p.graph.edges[row - size, 0], p.graph.edges[row - size, 1], w.u[row - size]
+    return p.graph.edges[row - barriers, 0], p.graph.edges[row - barriers, 1], w.u[row - barriers]
 
 
 @jit

@@ -31,14 +31,14 @@ _SQUARE = np.array(
 
 
 @jit
-def least_polynomial_value(work, degree, floor):
-    """Least value of a polynomial over [0, 1] and its place, if below ``floor``; otherwise ``floor`` and -1.
+def least_polynomial_value(work, degree, to_beat):
+    """Least value of a polynomial over [0, 1] and its place, if below ``to_beat``; otherwise ``to_beat`` and -1.
 
     ``work[0]`` holds the Bernstein coefficients. The value is exact to `CLOSE` and rounding; for squares, of eighth
     degree, its root is. After `_MOST` pieces, more than any known flight needs, the bound itself is returned, which
     errs on the safe side.
     """
-    best, at, top, pieces, size = floor, -1.0, 0, 0, 0.0
+    best, at, top, pieces, size = to_beat, -1.0, 0, 0, 0.0
     start, width = degree + 1, degree + 2
     work[0, start], work[0, width] = 0.0, 1.0
     for k in range(degree + 1):
@@ -150,13 +150,13 @@ def point_at(curve, x):
 
 
 @jit
-def least_norm_of_curve(curve, floor, work, pieces):
-    """Least |r| of a curve with control points (5, 3) and its place, if below ``floor``; otherwise ``floor`` and -1.
+def least_norm_of_curve(curve, to_beat, work, pieces):
+    """Least |r| of a curve with control points (5, 3) and its place, if below ``to_beat``; else ``to_beat`` and -1.
 
     Rounding of a squared length of some metres hides lengths of a millimetre. Therefore both halves of a long piece
     are examined again once their least length is roughly known.
     """
-    best, at, top, count = floor, -1.0, 0, 0
+    best, at, top, count = to_beat, -1.0, 0, 0
     start_piece_stack(curve, pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
@@ -244,12 +244,12 @@ def start_piece_stack(curve, pieces):
 
 
 @jit
-def distance_to_box(curve, b, part, floor, pieces, boxes):
-    """Least distance of a curve with control points (5, 3) from box b, if below ``floor``, and its place; else -1.
+def distance_to_box(curve, b, part, to_beat, pieces, boxes):
+    """Least distance of a curve with control points (5, 3) from box b, if below ``to_beat``, and its place; else -1.
 
     `obstacles` makes of this source the same for any solid, or a ``part`` of one, by another `tangent_of_box`.
     """
-    best, at, top, count, close = floor, -1.0, 0, 0, start_piece_stack(curve, pieces)
+    best, at, top, count, close = to_beat, -1.0, 0, 0, start_piece_stack(curve, pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
         distance, x, y, z = tangent_of_box(piece[6], piece[7], piece[8], b, part, boxes)
@@ -266,9 +266,9 @@ def distance_to_box(curve, b, part, floor, pieces, boxes):
 
 
 @jit
-def least_height_in_cylinder(points, reach, floor, pieces):
+def least_height_in_cylinder(points, reach, to_beat, pieces):
     """Least |z| of a curve with control points (5, 3) while within ``reach`` of the z axis, and its place."""
-    best, at, top, count, close = floor, -1.0, 0, 0, start_piece_stack(points, pieces)
+    best, at, top, count, close = to_beat, -1.0, 0, 0, start_piece_stack(points, pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
         for k in (0, 4):
@@ -294,9 +294,9 @@ def least_height_in_cylinder(points, reach, floor, pieces):
 
 
 @jit
-def least_norm_above(curve, own, other, altitude, floor, pieces):
+def least_norm_above(curve, own, other, altitude, to_beat, pieces):
     """Least |r| of a curve with control points (5, 3) while one of two others is at z >= ``altitude``; its place."""
-    best, at, top, count, close, rate = floor, -1.0, 0, 0, start_piece_stack(curve, pieces), 0.0
+    best, at, top, count, close, rate = to_beat, -1.0, 0, 0, start_piece_stack(curve, pieces), 0.0
     for k in range(1, 5):
         rate = max(rate, abs(own[k, 2] - own[k - 1, 2]), abs(other[k, 2] - other[k - 1, 2]))
     while top >= 0:

@@ -53,10 +53,10 @@ def fill_path_tables(k, i, tick, flight, state):
 
 
 @jit
-def neighbour_clock_offset(l, k, tick, mail):
-    """What the clock of link l's sender differs by from the time at tick k [s] by its newest message, and its rate."""
-    rate = mail.heard[l, CLOCK + 1]
-    return mail.heard[l, CLOCK] + (k - mail.stamp[l]) * tick * (rate - 1.0), rate
+def neighbour_clock_offset(link, tick_number, tick, mail):
+    """What the clock of a link's sender differs by from the time at a tick [s] by its newest message, and its rate."""
+    rate = mail.heard[link, CLOCK + 1]
+    return mail.heard[link, CLOCK] + (tick_number - mail.stamp[link]) * tick * (rate - 1.0), rate
 
 
 @jit

@@ -76,15 +76,15 @@ def solve_J_agent_by_agent(u, b, order, a):
 
 
 @jit_inline
-def balanced_forces(r, m, M, cm, I_inv, a, f):
-    """Forces f = M a (N, 3) of accelerations a (N, 3), without the rigid motion that carries their momentum.
+def balanced_forces(r, m, M, cm, I_inv, accels, out):
+    """Forces (N, 3) of accelerations (N, 3) into ``out``, without the rigid motion that carries their momentum.
 
     The forces then have zero sum, and zero torque about cm, the centre of mass of agents r (N, 3).
     """
     p0 = p1 = p2 = h0 = h1 = h2 = 0.0
     for i in range(r.shape[0]):
         x, y, z = r[i, 0] - cm[0], r[i, 1] - cm[1], r[i, 2] - cm[2]
-        a0, a1, a2 = m[i] * a[i, 0], m[i] * a[i, 1], m[i] * a[i, 2]
+        a0, a1, a2 = m[i] * accels[i, 0], m[i] * accels[i, 1], m[i] * accels[i, 2]
         p0, p1, p2 = p0 + a0, p1 + a1, p2 + a2
         h0 += y * a2 - z * a1
         h1 += z * a0 - x * a2
@@ -95,9 +95,9 @@ def balanced_forces(r, m, M, cm, I_inv, a, f):
     w2 = I_inv[2, 0] * h0 + I_inv[2, 1] * h1 + I_inv[2, 2] * h2
     for i in range(r.shape[0]):
         x, y, z = r[i, 0] - cm[0], r[i, 1] - cm[1], r[i, 2] - cm[2]
-        f[i, 0] = m[i] * (a[i, 0] - p0 - (w1 * z - w2 * y))
-        f[i, 1] = m[i] * (a[i, 1] - p1 - (w2 * x - w0 * z))
-        f[i, 2] = m[i] * (a[i, 2] - p2 - (w0 * y - w1 * x))
+        out[i, 0] = m[i] * (accels[i, 0] - p0 - (w1 * z - w2 * y))
+        out[i, 1] = m[i] * (accels[i, 1] - p1 - (w2 * x - w0 * z))
+        out[i, 2] = m[i] * (accels[i, 2] - p2 - (w0 * y - w1 * x))
 
 
 @jit

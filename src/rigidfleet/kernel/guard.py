@@ -69,9 +69,9 @@ _curve = jit_inline(thrust_of)
 
 
 @jit
-def stop_distance(u, i, a):
-    """Way [m] of vehicle i to rest from a speed u [m/s]."""
-    return way_to_rest(u, a.b[i], a.lag[i], a.period)
+def stop_distance(speed, i, a):
+    """Way [m] of vehicle i to rest from a speed [m/s]."""
+    return way_to_rest(speed, a.b[i], a.lag[i], a.period)
 
 
 @jit
@@ -119,8 +119,8 @@ def store_candidate(i, far, a):
 
 
 @jit
-def is_apart(i, v, j, s, floor, a):
-    """Whether the candidate of vehicle i keeps its distance from the present choice of j; velocities v and s (3,).
+def is_apart(i, v_i, j, v_j, floor, a):
+    """Whether the candidate of vehicle i keeps its distance from the present choice of j; velocities v_i and v_j (3,).
 
     The relative path over the tick lies beyond the parabola of its part along any unit vector. The vector is that to
     the nearest point of the chord.
@@ -145,7 +145,7 @@ def is_apart(i, v, j, s, floor, a):
         return size >= floor
     n0, n1, n2 = n0 / size, n1 / size, n2 / size
     along = n0 * x + n1 * y + n2 * z
-    rate = n0 * (v[0] - s[0]) + n1 * (v[1] - s[1]) + n2 * (v[2] - s[2])
+    rate = n0 * (v_i[0] - v_j[0]) + n1 * (v_i[1] - v_j[1]) + n2 * (v_i[2] - v_j[2])
     own = n0 * mine[4, 0] + n1 * mine[4, 1] + n2 * mine[4, 2]
     theirs = n0 * rise[0] + n1 * rise[1] + n2 * rise[2]
     # Drag lets accelerations decay during the tick
@@ -187,11 +187,11 @@ def clears_static_obstacles(i, v, far, a):
 
 
 @jit
-def interaction_range(u, c, a):
+def interaction_range(u, accel, a):
     """Distance [m] beyond which vehicles with speeds up to u [m/s] neither meet by the next tick nor meet a barrier.
 
     A barrier asks for nothing while rate h + B s/sqrt(2 B (L - D)) is above the greatest relative acceleration, twice
-    that asked for, c [m/s^2]; s is at least -2 u.
+    that asked for, ``accel`` [m/s^2]; s is at least -2 u.
     """
     room = stop = strongest = lift = lag = behind = soft = 0.0
     weakest = math.inf
@@ -203,7 +203,7 @@ def interaction_range(u, c, a):
     meet = 2.0 * (stop + a.period * (u + a.period * (lift + a.g)))
     barrier = 0.0
     if a.filtered:
-        half, B = a.rate * (u + a.share * soft) + c, 2.0 * a.share * strongest
+        half, B = a.rate * (u + a.share * soft) + accel, 2.0 * a.share * strongest
         root = (half + math.sqrt(half * half + 2.0 * a.rate * B * u)) / a.rate
         barrier = root * root / (4.0 * a.share * weakest) + 2.0 * u * lag
     return 2.0 * (room + behind) + max(meet, barrier)
@@ -438,11 +438,11 @@ def propose_acceleration(i, k, v, a, c):
 
 
 @jit
-def least_margin_if_braking(i, r, v, late, a):
+def least_margin_if_braking(i, r, v, too_late, a):
     """What `choose_acceleration` compares of vehicle i, if it brakes [m]."""
     c = a.trial[3]
     braking_acceleration(i, v[i], a, c)
-    if late:
+    if too_late:
         return miss_distance(r[i], v[i], c, a)
     predict_motion(i, r[i], v[i], c, a, a.trial)
     return margin_to_moving_obstacles(i, v[i], a)

@@ -57,24 +57,24 @@ def cholesky(A):
 
 
 @jit
-def cholesky_solve(A, x):
-    """Solve L D L^T x = x in place, A as left by `cholesky`; two unknowns at a time."""
-    n = A.shape[0]
+def cholesky_solve(factor, x):
+    """Solve L D L^T x = x in place, ``factor`` as left by `cholesky`; two unknowns at a time."""
+    n = factor.shape[0]
     odd = n % 2
     for i in range(odd, n, 2):
         s, t = x[i], x[i + 1]
         for k in range(i):
-            s -= A[i, k] * x[k]
-            t -= A[i + 1, k] * x[k]
-        x[i], x[i + 1] = s, t - A[i + 1, i] * s
+            s -= factor[i, k] * x[k]
+            t -= factor[i + 1, k] * x[k]
+        x[i], x[i + 1] = s, t - factor[i + 1, i] * s
     for i in range(n):
-        x[i] *= A[i, i]
+        x[i] *= factor[i, i]
     for i in range(n - 2, odd - 1, -2):
         t = x[i + 1]
-        s = x[i] - A[i + 1, i] * t
+        s = x[i] - factor[i + 1, i] * t
         x[i] = s
         for k in range(i):
-            x[k] -= A[i, k] * s + A[i + 1, k] * t
+            x[k] -= factor[i, k] * s + factor[i + 1, k] * t
 
 
 @jit

@@ -301,11 +301,11 @@ def eigenvector_of_value(I, x, axis):
 
 
 @jit
-def measure_slot_attitude(m, k, known, line_known, near, work, T):
-    """Attitude of the slots at sample k into ``m.attitude`` and T (3, 3); returns whether they count as a line.
+def measure_slot_attitude(m, sample, is_commanded, line_known, prior, work, T):
+    """Attitude of the slots at a sample into ``m.attitude`` and T (3, 3); returns whether they count as a line.
 
-    ``near`` (3, 3) is the attitude expected, commanded (``known``) or that of the sample before. ``line_known`` tells
-    that the slots are those of the sample before, whose extent is in ``work[7]``.
+    ``prior`` (3, 3) is the attitude expected, commanded (``is_commanded``) or that of the sample before. ``line_known``
+    tells that the slots are those of the sample before, whose extent is in ``work[7]``.
     """
     x, p, mass = m.x[0], m.x[1], m.left
     B, K, V, w, axis, size = work[0], work[1], work[2], work[3, 0], work[7, 0], work[7, 1]
@@ -314,8 +314,8 @@ def measure_slot_attitude(m, k, known, line_known, near, work, T):
         size[0], size[1] = width_length_and_axis(p, mass, K, V, w, axis)
     width, length = size[0], size[1]
     line = width <= _THIN * length
-    if line or (known and width <= _NARROW * length):
-        attitude_of_line(x, p, mass, axis, near, T, work[3, 1], work[3, 2], work[3, 3])
+    if line or (is_commanded and width <= _NARROW * length):
+        attitude_of_line(x, p, mass, axis, prior, T, work[3, 1], work[3, 2], work[3, 3])
         if not line:
             off = 0.0
             for i in range(n):
@@ -324,7 +324,7 @@ def measure_slot_attitude(m, k, known, line_known, near, work, T):
                     off += mass[i] * d * d
             line = width <= _SURE * math.sqrt(off)
         if line:
-            quaternion_of(T, m.attitude[k])
+            quaternion_of(T, m.attitude[sample])
             return True
     bound = 0.0
     for a in range(3):
@@ -335,8 +335,8 @@ def measure_slot_attitude(m, k, known, line_known, near, work, T):
             B[a, b] = s
         for i in range(n):
             bound += 0.5 * mass[i] * (p[i, a] * p[i, a] + x[i, a] * x[i, a])
-    fit_quaternion(B, bound, K, V, w, m.attitude[k])
-    attitude_matrix(m.attitude[k], T)
+    fit_quaternion(B, bound, K, V, w, m.attitude[sample])
+    attitude_matrix(m.attitude[sample], T)
     return False
 
 
@@ -457,9 +457,9 @@ def measure_cm_and_wrench(m, k, mass, M):
 
 
 @jit
-def angular_momentum(m, k, mass, h):
-    """h = sum m x cross v about the centre of mass at sample k, Eq. (17), into h (3,)."""
-    V, v, x = m.cm_velocity[k], m.v[k], m.x[0]
+def angular_momentum(m, sample, mass, h):
+    """h = sum m x cross v about the centre of mass at a sample, Eq. (17), into h (3,)."""
+    V, v, x = m.cm_velocity[sample], m.v[sample], m.x[0]
     h[0] = h[1] = h[2] = 0.0
     for i in range(x.shape[0]):
         X, Y, Z = v[i, 0] - V[0], v[i, 1] - V[1], v[i, 2] - V[2]

@@ -76,10 +76,10 @@ _NARROW = 1e-3
 
 
 @jit
-def store_if_worse(kind, key, t, first, second, monitor):
-    """Store a value that is worse than the worst one of its kind; a smaller ``key`` is worse."""
-    if key < monitor.worst[kind]:
-        monitor.worst[kind] = key
+def store_if_worse(kind, value, t, first, second, monitor):
+    """Store a value that is worse than the worst one of its kind; a smaller ``value`` is worse."""
+    if value < monitor.worst[kind]:
+        monitor.worst[kind] = value
         monitor.when[kind] = t
         monitor.who[kind, 0], monitor.who[kind, 1] = first, second
 
@@ -141,10 +141,10 @@ def bernstein_column_value(basis, points, q):
 
 
 @jit
-def world_control_points(points, i, moving, p, monitor, out):
-    """Control points (5, 3) of agent i's position in the world, or of its velocity (``moving`` 1)."""
+def world_control_points(points, i, derivative, p, monitor, out):
+    """Control points (5, 3) of agent i's position in the world, or of its velocity (``derivative`` 1)."""
     n = p.vehicles.m.shape[0]
-    first = 3 * i + 3 * n * moving
+    first = 3 * i + 3 * n * derivative
     if not p.body_formulation:
         for k in range(5):
             for q in range(3):
@@ -156,7 +156,7 @@ def world_control_points(points, i, moving, p, monitor, out):
         for q in range(3):
             in_body[q] = bernstein_column_value(monitor.basis[k], points, first + q)
         for q in range(3):
-            at_knots[k, q] = monitor.centres[k, 3 * moving + q]
+            at_knots[k, q] = monitor.centres[k, 3 * derivative + q]
             for s in range(3):
                 at_knots[k, q] += T[s, q] * in_body[s]
     for k in range(5):
@@ -499,23 +499,23 @@ def update_force_extremes(values, t, p, monitor):
 
 
 @jit
-def worst_so_far(c, p, monitor):
-    """The greatest value so far of the quantity of entry c of a gauge."""
+def worst_so_far(entry, p, monitor):
+    """The greatest value so far of the quantity of an entry of a gauge."""
     n, m = p.vehicles.m.shape[0], p.graph.edges.shape[0]
-    of_agent = c if c < 3 * n else c - 3 * n - 2 * m  # negative of an edge
+    of_agent = entry if entry < 3 * n else entry - 3 * n - 2 * m  # negative of an edge
     if of_agent >= 0 and not monitor.left[of_agent % n]:
         return math.inf
-    if c < n:
-        limit = p.vehicles.thrust_limit[c]
+    if entry < n:
+        limit = p.vehicles.thrust_limit[entry]
         beyond = limit - monitor.worst[THRUST_MARGIN] if limit < math.inf else math.inf
         return min(-monitor.worst[THRUST], beyond)
-    if c < 2 * n:
+    if entry < 2 * n:
         return -monitor.worst[ACCELERATION]
-    if c < 3 * n:
+    if entry < 3 * n:
         return -monitor.worst[CONSTRAINT_FORCE]
     if of_agent >= 0:
         return -monitor.worst[HORIZONTAL_ACCELERATION + of_agent // n]
-    return -monitor.worst[TENSION if c < 3 * n + m else CONSTRAINT]
+    return -monitor.worst[TENSION if entry < 3 * n + m else CONSTRAINT]
 
 
 @jit
@@ -634,8 +634,8 @@ def watch_single_step_forces(step, before, after, p, w, state, monitor):
 
 
 @jit
-def watch_forces(last, p, w, state, monitor):
-    """Take the extremes of forces over the steps of a trail; with ``last``, no further step of the segment follows.
+def watch_forces(is_last, p, w, state, monitor):
+    """Take the extremes of forces over the steps of a trail; with ``is_last``, no further step of the segment follows.
 
     Otherwise the last step stays in the trail: a peak at its end shows only once the next step is known.
     """
@@ -658,9 +658,9 @@ def watch_forces(last, p, w, state, monitor):
         if step + 1 < steps:
             then, until = trail.gauge[trail_row_of(step + 1, state)], step_end_time(step + 1, state)
             search_forces_in(earlier, after, then, step, start, end, until, p, w, state, monitor)
-        elif last and (step > 0 or not new):
+        elif is_last and (step > 0 or not new):
             watch_single_step_forces(step, earlier, after, p, w, state, monitor)
-    if last or steps == 0:
+    if is_last or steps == 0:
         monitor.count[STAYED], state.count[TRAILED] = 0, 0
     else:
         keep_only_last_step(steps, state, monitor)

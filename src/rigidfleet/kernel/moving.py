@@ -171,20 +171,20 @@ def braking_relative_to_obstacle(i, o, v, a, out):
 
 
 @jit
-def way_to_rest(u, b, lag, T):
+def way_to_rest(u, b, lag, period):
     """Way [m] to rest from a speed u [m/s], with commands held for a period: n whole ones, then one to rest."""
-    change = b * T
+    change = b * period
     # A command holds for a whole period, so that the last one brakes by less: the way is a little more than u^2 / 2b.
     n = math.floor(u / change)
     rest = u - n * change
-    return T * (n * (u - 0.5 * n * change) + 0.5 * rest) + lag * u
+    return period * (n * (u - 0.5 * n * change) + 0.5 * rest) + lag * u
 
 
 @jit
-def required_obstacle_distance(i, o, speed, b, a):
+def required_obstacle_distance(i, o, speed, braking, a):
     """Distance [m] from obstacle o, which moves, to keep by the stop segment of vehicle i at a relative speed."""
     bound = a.sight.bound[o]
-    return a.reach[i] + a.spare[i] + bound[0] + bound[1] * speed / b
+    return a.reach[i] + a.spare[i] + bound[0] + bound[1] * speed / braking
 
 
 @jit
@@ -245,10 +245,10 @@ def margin_to_moving_obstacles(i, v, a):
 
 
 @jit
-def miss_distance(r, v, c, a):
-    """By how much a vehicle at r with v (3,) misses all obstacles that move [m], if it holds an acceleration c (3,).
+def miss_distance(r, v, accel, a):
+    """By how much a vehicle at r with v (3,) misses all obstacles that move [m], if it holds an acceleration (3,).
 
-    That is the least distance of its centre at some times, up to twice that of the nearest approach without c.
+    That is the least distance of its centre at some times, up to twice that of the nearest approach without it.
     """
     least = math.inf
     for o in range(a.sight.moves.shape[0]):
@@ -264,8 +264,8 @@ def miss_distance(r, v, c, a):
         for k in range(1, _LOOKS + 1):
             t = max(until, a.period) * k / _LOOKS
             away = obstacle_distance(
-                r[0] - x[0] + t * (w[0] + 0.5 * t * c[0]), r[1] - x[1] + t * (w[1] + 0.5 * t * c[1]),
-                r[2] - x[2] + t * (w[2] + 0.5 * t * c[2]), o, a.solids, a.normal,
+                r[0] - x[0] + t * (w[0] + 0.5 * t * accel[0]), r[1] - x[1] + t * (w[1] + 0.5 * t * accel[1]),
+                r[2] - x[2] + t * (w[2] + 0.5 * t * accel[2]), o, a.solids, a.normal,
             )  # fmt: skip
             least = min(least, away)
     return least

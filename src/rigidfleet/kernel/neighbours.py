@@ -78,32 +78,32 @@ def fade_silent_edges(i, k, ticks, net, mail):
 
 
 @jit
-def extrapolate_neighbour(j, q, age, message, tracks, w, k1, k2):
-    """Coordinate q of where vehicle j is, how fast, and what its input accelerates it by, ``age`` [s] after a message.
+def extrapolate_neighbour(j, axis, age, message, tracks, w, k1, k2):
+    """Where vehicle j is along an axis, how fast, and what its input accelerates it by, ``age`` [s] after a message.
 
     What it is off its slot moves on by its acceleration; the slot moves as planned, whatever the age. Without a slot,
     the vehicle itself moves on. Its input follows what it is off by the gains k1 [1/s^2] and k2 [1/s].
     """
-    r, v, a, put = message[R + q], message[V + q], message[A + q], message[U + q]
+    r, v, a, put = message[R + axis], message[V + axis], message[A + axis], message[U + axis]
     if not tracks or message[TRACKED] == 0.0:  # or sent before slots were tracked
         return r + age * (v + 0.5 * age * a), v + age * a, put
-    v, a = v - message[SLOT + 3 + q], a - message[SLOT + 6 + q]
-    place = w.r_ref[j, q] + r - message[SLOT + q] + age * (v + 0.5 * age * a)
-    put += w.a_ref[j, q] - message[SLOT + 6 + q] - age * (k1 * (v + 0.5 * age * a) + k2 * a)
-    return place, w.v_ref[j, q] + v + age * a, put
+    v, a = v - message[SLOT + 3 + axis], a - message[SLOT + 6 + axis]
+    place = w.r_ref[j, axis] + r - message[SLOT + axis] + age * (v + 0.5 * age * a)
+    put += w.a_ref[j, axis] - message[SLOT + 6 + axis] - age * (k1 * (v + 0.5 * age * a) + k2 * a)
+    return place, w.v_ref[j, axis] + v + age * a, put
 
 
 @jit
-def equation_of_edge(row, l, k, dt, tick, p, w, net, mail, saturated):
-    """Row of vehicle i's own equations for the edge of link l, from its state in w.r and w.v, and its message.
+def equation_of_edge(row, link, k, dt, tick, p, w, net, mail, saturated):
+    """Row of vehicle i's own equations for the edge of a link, from its state in w.r and w.v, and its message.
 
     Fills the unit vector from the neighbour and the right side of Eq. (12) without any constraint force; integrates the
     constraint over dt [s].
     """
-    i, j, c = net.links[l, 0], net.links[l, 1], mail.edge[l]
-    rows, heard, own, law = mail.rows, mail.heard[l], mail.own[l], p.law
-    age = (k - mail.stamp[l]) * tick
-    mail.oldest[l] = max(mail.oldest[l], k - mail.stamp[l])
+    i, j, c = net.links[link, 0], net.links[link, 1], mail.edge[link]
+    rows, heard, own, law = mail.rows, mail.heard[link], mail.own[link], p.law
+    age = (k - mail.stamp[link]) * tick
+    mail.oldest[link] = max(mail.oldest[link], k - mail.stamp[link])
     tracks = p.control.kind == TRACKING
     distance = along = square = pull = 0.0
     x, k1, k2 = rows[row, _UNIT:_RIGHT], p.control.k1, p.control.k2
@@ -123,19 +123,19 @@ def equation_of_edge(row, l, k, dt, tick, p, w, net, mail, saturated):
         x[q] /= distance
     d_dot = d_ddot = 0.0
     if c >= 0:
-        mail.length[l], d_dot, d_ddot = w.d[c], w.d_dot[c], w.d_ddot[c]
-    off, share = distance - mail.length[l], mail.multiplier.shape[1] - 1
+        mail.length[link], d_dot, d_ddot = w.d[c], w.d_dot[c], w.d_ddot[c]
+    off, share = distance - mail.length[link], mail.multiplier.shape[1] - 1
     if not saturated and heard[SATURATED] == 0.0:
-        mail.multiplier[l, share] += dt * off
+        mail.multiplier[link, share] += dt * off
     rows[row, _RIGHT] = (
         d_ddot
         - (square - along * along) / distance
         - pull
         - 2.0 * law.alpha * (along - d_dot)
         - law.beta * law.beta * off
-        - law.gamma * mail.multiplier[l, share]
+        - law.gamma * mail.multiplier[link, share]
     )
-    rows[row, _LINK] = l
+    rows[row, _LINK] = link
 
 
 @jit

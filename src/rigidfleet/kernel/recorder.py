@@ -26,13 +26,13 @@ def fill_with_nan(out):
 
 
 @jit
-def write_record(times, samples, p, w, dy, out, first):
+def write_record(times, samples, p, w, scratch, out, first):
     """Evaluate the closed loop at the sampled states, and record its forces and references from row ``first`` on.
 
     Without rows in ``out``, the only result is what the last evaluation leaves in the workspace.
     """
     for k in range(times.shape[0]):
-        closed_loop(times[k], samples[k], dy, p, w)
+        closed_loop(times[k], samples[k], scratch, p, w)
         if first + k < out.r.shape[0]:
             record_sample(times[k], p, w, first + k, out)
 

@@ -72,10 +72,10 @@ class Trail(NamedTuple):
     start: Floats  # (3N + 2m or 5N + 2m,) at the start of the first step, after a jump
 
 
-def new_trail(size: int, states: int, agents: int, edges: int, directed: bool) -> Trail:
-    """Allocate a trail of a ``size`` in bytes, or of three steps; ``directed``: with accelerations by direction."""
+def new_trail(n_bytes: int, states: int, agents: int, edges: int, directed: bool) -> Trail:
+    """Allocate a trail of ``n_bytes``, or of three steps; ``directed``: with accelerations by direction."""
     gauge = (5 if directed else 3) * agents + 2 * edges
-    rows = max(3, size // (8 * (5 * states + gauge)))
+    rows = max(3, n_bytes // (8 * (5 * states + gauge)))
     shapes = (rows, 2), (rows, 5, states), (rows, gauge), (gauge,)
     return Trail(*(np.empty(shape) for shape in shapes))
 

@@ -390,12 +390,12 @@ def run_tick(k, t, p, w, flight, state, call):
 
 
 @jit
-def advance_states(S, h, flight, state):
-    """Advance all vehicles by h [s] in ``work.y``, from states S (N, 17) to row 6."""
+def advance_states(start, h, flight, state):
+    """Advance all vehicles by h [s] in ``work.y``, from states ``start`` (N, 17) to row 6."""
     work = state.work
-    for i in range(S.shape[0]):
+    for i in range(start.shape[0]):
         for q in range(17):
-            work.y[0, 17 * i + q] = S[i, q]
+            work.y[0, 17 * i + q] = start[i, q]
     runge_kutta(h, state.command, flight.vehicles, flight.air, state.push, work)
 
 
@@ -420,13 +420,13 @@ def find_air_velocity(t, h, S, p, flight, state):
 
 
 @jit
-def write_derivatives(c, t, p, flight, state, call):
-    """Derivatives of the states of sample c: those at the start of a step without length."""
-    find_air_velocity(t, 0.0, call.S[c], p, flight, state)
-    advance_states(call.S[c], 0.0, flight, state)
+def write_derivatives(sample, t, p, flight, state, call):
+    """Derivatives of the states of a sample: those at the start of a step without length."""
+    find_air_velocity(t, 0.0, call.S[sample], p, flight, state)
+    advance_states(call.S[sample], 0.0, flight, state)
     for i in range(state.S.shape[0]):
         for q in range(17):
-            call.dS[c, i, q] = state.work.y[2, 17 * i + q]
+            call.dS[sample, i, q] = state.work.y[2, 17 * i + q]
 
 
 @jit

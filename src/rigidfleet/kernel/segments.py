@@ -53,28 +53,28 @@ def segment_distance(p, q, r, s):
 
 
 @jit
-def hull_gap(p, last, a, q, end, b, enough, x):
-    """Least distance [m] between the hulls of p[0], p[1], p[last], a (2, 3) and of q[0], q[1], q[end], b; x (3,): work.
+def hull_gap(p, p_third, p_more, q, q_third, q_more, enough, x):
+    """Least distance [m] between the hulls of p[0], p[1], p[p_third], p_more (2, 3) and of q likewise; x (3,): work.
 
     Gilbert's algorithm on the differences of points (SIAM J. Control 4, 1966): a lower bound, exact to 1e-9 unless it
     is certain to be at least, or below, ``enough`` (NaN: always), or after many steps: then it is low
     by some hundredths of their size at most.
     """
     for k in range(3):
-        x[k] = a[0, k] - b[0, k]
+        x[k] = p_more[0, k] - q_more[0, k]
     bound = 0.0
     for _ in range(_STEPS):
         size = math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
         if size < enough or size == 0.0:
             return size
         near, far = math.inf, -math.inf
-        u, w = a[0], b[0]
+        u, w = p_more[0], q_more[0]
         for k in range(5):
-            y = a[k - 3] if k > 2 else p[last if k == 2 else k]
+            y = p_more[k - 3] if k > 2 else p[p_third if k == 2 else k]
             along = x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
             if along < near:
                 near, u = along, y
-            y = b[k - 3] if k > 2 else q[end if k == 2 else k]
+            y = q_more[k - 3] if k > 2 else q[q_third if k == 2 else k]
             along = x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
             if along > far:
                 far, w = along, y

@@ -338,7 +338,7 @@ def is_stable(loops: Sequence[Loop], law: LoopGains, growth: float = GROWTH) -> 
     return all(_is_stable(loop, law, growth) for loop in sorted(loops, key=lambda x: len(x.S)))
 
 
-def _is_stable(loop: Loop, law: LoopGains, growth: float) -> bool:
+def _is_stable(loop: Loop, law: LoopGains, growth_limit: float) -> bool:
     """`is_stable` of one loop; never where a vehicle's attitude itself is unstable."""
     if not all(lag.stable for lag, _ in loop.channels):
         return False
@@ -350,10 +350,10 @@ def _is_stable(loop: Loop, law: LoopGains, growth: float) -> bool:
         return True
 
     def return_difference(omega: Floats) -> Complexes:
-        return np.eye(n) + loop.gain(growth + 1j * omega, law)
+        return np.eye(n) + loop.gain(growth_limit + 1j * omega, law)
 
     # The poles of L at 0 are left of this line. To its right L is analytic and vanishes at infinity.
-    omega = np.append(0.0, np.geomspace(0.1 * growth, end, _SAMPLES))
+    omega = np.append(0.0, np.geomspace(0.1 * growth_limit, end, _SAMPLES))
     F = return_difference(omega)
     turn = np.linalg.solve(F[:-1], F[1:])
     for _ in range(30):

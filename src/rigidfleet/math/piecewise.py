@@ -98,9 +98,9 @@ class Piecewise(NamedTuple):
         begin = series.polynomial_series(self.pieces[1:], np.zeros(len(self.pieces) - 1), orders)
         return series.taylor_derivatives(begin - end)
 
-    def shift_time(self, start: float) -> Piecewise:
+    def shift_time(self, delay: float) -> Piecewise:
         """The same, begun later [s]."""
-        return Piecewise(self.time + start, self.pieces)
+        return Piecewise(self.time + delay, self.pieces)
 
     def with_knots(self, knots: Floats, *, stays: bool = False) -> Piecewise:
         """The same on other knots (K' + 1,) [s], no interval of which contains one of its own.

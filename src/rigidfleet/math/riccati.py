@@ -178,7 +178,7 @@ def _fastest_rate(A: Floats, G: Floats, Q: Floats) -> float:
 
 
 def _transition_and_gramians(
-    A: Floats, G: Floats, Q: Floats, tau: Floats, rate: float
+    A: Floats, G: Floats, Q: Floats, tau: Floats, fastest_rate: float
 ) -> tuple[Floats, Floats, Floats, Bools]:
     """Phi, W, V (..., n, n): x(tau) = Phi x(0) - W y(tau), y(0) = V x(0) + Phi^T y(tau).
 
@@ -193,7 +193,7 @@ def _transition_and_gramians(
     identity = np.eye(n)
     backward = -hamiltonian(A, G, Q)
     with np.errstate(divide="ignore"):
-        doublings = np.ceil(np.log2(2.0 * rate * tau)).clip(min=0.0)
+        doublings = np.ceil(np.log2(2.0 * fastest_rate * tau)).clip(min=0.0)
     # A Taylor series, because each entry keeps its own leading power of the step. A Pade approximant
     # would round the small entries (W begins with the third power) relative to the large ones.
     step = backward * (tau * 0.5**doublings)[..., None, None]

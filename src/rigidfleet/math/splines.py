@@ -71,11 +71,11 @@ def _jumps(times: Floats, x: Floats) -> Floats:
     return np.moveaxis(Piecewise.hermite(times, x).jumps(7)[4:], 0, 1)
 
 
-def snap_cost(pieces: Floats, times: Floats) -> float:
-    """Integral of |snap|^2 [m^2/s^7] over pieces (n, ..., 8) between times (n + 1,) [s]."""
+def snap_cost(pieces: Floats, knots: Floats) -> float:
+    """Integral of |snap|^2 [m^2/s^7] over pieces (n, ..., 8) between knots (n + 1,) [s]."""
     k = np.arange(4, POWERS)
     factor = k * (k - 1.0) * (k - 2.0) * (k - 3.0)
-    h = np.diff(times).reshape(-1, *(1,) * (pieces.ndim - 1))
+    h = np.diff(knots).reshape(-1, *(1,) * (pieces.ndim - 1))
     c = pieces[..., 4:] * factor * h ** (k - 4.0)
     weights = 1.0 / (k[:, None] + k - 7.0)
     return float(

@@ -146,15 +146,15 @@ def _validate_tables(m: Draft) -> None:
         m.add(("agents",), "is missing", "add a table [agents] with mass and position")
 
 
-def _replace_start_shape(m: Draft, agents: Any) -> Any:
+def _replace_start_shape(m: Draft, agents_table: Any) -> Any:
     """Return [agents] with a shape of `position` replaced by its points; None if the shape has errors."""
-    path, position = ("agents", "position"), look_up(agents, ("position",))
+    path, position = ("agents", "position"), look_up(agents_table, ("position",))
     if isinstance(position, str):
         remedy = "load the mission from its file, or give the positions as points"
         m.add(path, NOT_A_FILE, remedy)
         return None
     if not isinstance(position, dict):
-        return agents
+        return agents_table
     start = m.validate(Start, position, path)
     if start is None or not m.is_valid((), "agents"):
         return None
@@ -169,7 +169,7 @@ def _replace_start_shape(m: Draft, agents: Any) -> Any:
         problem = f"agents start farther than {bounds.LENGTH.most:g} m from the origin"
         m.add(path, problem, "reduce size, count or centre")
         return None
-    return agents | {"position": points.tolist()}
+    return agents_table | {"position": points.tolist()}
 
 
 def _count_agents(data: Mapping[str, Any]) -> int | None:

@@ -61,7 +61,7 @@ class VehicleModel(NamedTuple):
     drag: float = 0.0
 
     @property
-    def rotor_limit(self) -> float:
+    def rotor_thrust_limit(self) -> float:
         """Maximum thrust of one rotor [N]."""
         return self.thrust_coefficient * self.rotor_speed[1] ** 2
 
@@ -105,7 +105,7 @@ def model_of_vehicle(vehicle: Vehicle) -> VehicleModel:
         return VehicleModel(point=True, **own)
     usual = {key: value for key, (value, _) in MODELS[vehicle.model].items()}
     model = VehicleModel(point=False, **(usual | own))
-    return model._replace(thrust_limit=4.0 * model.rotor_limit)
+    return model._replace(thrust_limit=4.0 * model.rotor_thrust_limit)
 
 
 def validate_vehicles(m: Draft) -> None:

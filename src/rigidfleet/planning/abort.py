@@ -498,8 +498,8 @@ class Aborts:
         """Ways home from farther and farther back along the plan, from a time along it where all rest at a time [s]."""
         for far in np.append(np.arange(_BACK, path, _BACK), path).tolist():
 
-            def backward_clock(time: float, far: float = far) -> Piecewise:
-                return _path_clock(path, time, -far / time * _BLEND)
+            def backward_clock(duration: float, far: float = far) -> Piecewise:
+                return _path_clock(path, duration, -far / duration * _BLEND)
 
             time, _ = self._least_time_along(_FASTEST * far, self.home_limits, backward_clock)
             home = self.straight_ways_home(self.plan.at(np.array([path - far]))[0], begin + time)

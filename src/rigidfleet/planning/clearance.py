@@ -174,8 +174,8 @@ def _path_and_speeds(
     return at, np.concatenate([first, planned.position[within], last]), speed[span]
 
 
-def greatest_shift(solid: Solids, begin: Floats, end: Floats) -> Floats:
+def greatest_shift(solid: Solids, begins: Floats, ends: Floats) -> Floats:
     """Greatest way (L,) [m] of a solid between times (L,) [s]: its greatest speed counts wherever it moves."""
     speed = np.linalg.norm(np.diff(solid.ways, axis=0), axis=1) / np.diff(solid.times)
-    within = (solid.times[:-1] < end[:, None]) & (solid.times[1:] > begin[:, None])
-    return np.where(within, speed, 0.0).max(axis=1, initial=0.0) * (end - begin)
+    within = (solid.times[:-1] < ends[:, None]) & (solid.times[1:] > begins[:, None])
+    return np.where(within, speed, 0.0).max(axis=1, initial=0.0) * (ends - begins)

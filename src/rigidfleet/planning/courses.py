@@ -112,7 +112,7 @@ def _turn_course(mission: Mission, phase: Turn, now: PhaseState, t_end: float) -
 
 
 def _steer_course(
-    mission: Mission, phase: Steering, now: PhaseState, t_end: float, r: Floats, v: Floats
+    mission: Mission, phase: Steering, now: PhaseState, t_end: float, r_goal: Floats, v_goal: Floats
 ) -> Course:
     """Go to a place (3,) with a velocity there and an attitude, within ``travel`` or by the end."""
     _, before, _ = now.pose_goal_and_slots
@@ -120,7 +120,7 @@ def _steer_course(
     angles = phase.attitude_deg
     T = before.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
     named = before.named or angles is not None
-    goal = Pose(r, v, T, np.deg2rad(phase.rates_deg_s), named)
+    goal = Pose(r_goal, v_goal, T, np.deg2rad(phase.rates_deg_s), named)
     return _course_to(mission, phase, now, goal, arrival, t_end)
 
 

@@ -242,12 +242,12 @@ def yaw_along(
     return np.stack([angles, first, second]), (float(ends[known]), grid[known])
 
 
-def _yaw_ode_terms(slots: Floats) -> tuple[Floats, Floats]:
+def _yaw_ode_terms(taylor: Floats) -> tuple[Floats, Floats]:
     """Terms A, B, C (3, N, K) of yaw' = A + B cos yaw + C sin yaw of kind "along", and their rates, from `slot_taylor`.
 
     |v| - h . v becomes (|v|^2 - |v| h . v) / sqrt(|v|^2 + SLOW^2), which is smooth at rest.
     """
-    v, a, j = series.taylor_derivatives(slots[:4, :2])[1:]
+    v, a, j = series.taylor_derivatives(taylor[:4, :2])[1:]
     vv, va = (v * v).sum(axis=0), (v * a).sum(axis=0)
     size, speed = vv + SLOW**2, np.sqrt(vv)
     root = np.sqrt(size)

@@ -181,10 +181,10 @@ class PhasePlan(Leg):
         share = min(max(_RESIDUAL * self.integrator.rtol, _LEAST_RESIDUAL), _MOST_RESIDUAL)
         return share, _FLOOR * float(self.velocity_tolerance().min())  # over a step of 1 s
 
-    def remove_lost_edges(self, lost: Bools, parted: Bools) -> Bools:
-        """Remove the edges of vehicles ``lost`` (N,) and links ``parted`` (L,); return which edges (m,) are kept."""
+    def remove_lost_edges(self, lost: Bools, lost_links: Bools) -> Bools:
+        """Remove the edges of vehicles ``lost`` (N,) and ``lost_links`` (L,); return which edges (m,) are kept."""
         n = len(lost)
-        pairs = self.links_lost[0][parted]
+        pairs = self.links_lost[0][lost_links]
         keys = self.edges[:, 0] * n + self.edges[:, 1]
         kept = ~np.any(lost[self.edges], axis=1) & ~np.isin(keys, pairs[:, 0] * n + pairs[:, 1])
         self.edges, self.distances = self.edges[kept], self.distances[kept]

@@ -149,14 +149,14 @@ def _b_spline_weights(u: Floats, spans: int) -> Floats:
     return B
 
 
-def _half_ellipse_control_points(s: Floats, g: Floats) -> Floats:
+def _half_ellipse_control_points(start: Floats, goal: Floats) -> Floats:
     """Control points (M + 3, N, 3) of ways that all keep to the right, seen from above on half an ellipse.
 
     Where each vehicle goes to the opposite place of a circle, this is half a turn of them all.
     """
-    way = g - s
+    way = goal - start
     right = 0.5 * np.stack([way[:, 1], -way[:, 0], 0.0 * way[:, 0]], axis=1)
-    return s + 0.5 * (1.0 - np.cos(np.pi * _SHARE)) * way + np.sin(np.pi * _SHARE) * right
+    return start + 0.5 * (1.0 - np.cos(np.pi * _SHARE)) * way + np.sin(np.pi * _SHARE) * right
 
 
 def _descend(control: Floats, duration: float, limits: _Limits, rng: np.random.Generator) -> Floats:

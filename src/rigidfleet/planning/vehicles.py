@@ -393,12 +393,12 @@ class TickTables:
             self._known = turn, *known
         return _tick_rows(turned[..., 1:]), series.taylor_derivatives(slots[..., 1:])
 
-    def _desired_jerk_and_snap(self, x: Floats) -> tuple[Floats, Floats]:
+    def _desired_jerk_and_snap(self, derivatives: Floats) -> tuple[Floats, Floats]:
         """Two derivatives (K, N, 3) of the desired force per mass, from those of the reference, (5, 3, N, K).
 
         Drag that is fed forward changes the force with the velocity; near level flight body axes are the world's.
         """
-        _, v, a, j, s = x
+        _, v, a, j, s = derivatives
         vehicles = self.flight.vehicles
         share = self.flight.guidance.drag / vehicles.m
         D, c = (share[:, None] * drag.T[..., None] for drag in (self.linear_drag, vehicles.c))

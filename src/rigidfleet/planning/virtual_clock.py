@@ -89,9 +89,9 @@ class VirtualClock:
         self.delay += lost
         return lost
 
-    def time_until_progress(self, progress: float, dt: float) -> float:
-        """Time [s], at most dt, after which tau will have made a progress [s]."""
-        low, high = 0.0, dt
+    def time_until_progress(self, progress: float, most: float) -> float:
+        """Time [s], at most ``most``, after which tau will have made a progress [s]."""
+        low, high = 0.0, most
         for _ in range(60):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self.progress_in(middle)[0] < progress else (low, middle)

@@ -225,10 +225,10 @@ def euler_deg(quaternions: Floats) -> Floats:
     return np.degrees(angles)
 
 
-def _unwrap_near(angles: Floats, to: Floats) -> Floats:
+def _unwrap_near(degrees: Floats, to: Floats) -> Floats:
     """Angles [deg] shifted by full turns to lie near the angles ``to``, where both are known."""
-    shift = np.round((to - angles) / 360.0) * 360.0
-    return angles + np.where(np.isfinite(shift), shift, 0.0)
+    shift = np.round((to - degrees) / 360.0) * 360.0
+    return degrees + np.where(np.isfinite(shift), shift, 0.0)
 
 
 def flown_and_wanted_euler(result: Result) -> tuple[Floats, Floats, list[tuple[float, Floats]]]:

@@ -119,8 +119,8 @@ def growth_at_delay(flight: LinearFlight, delay: int, accuracy: float = _FINE[0]
     size = flight.size + math.prod(messages)
     drift = np.zeros((size, 0))
 
-    def arriving_updates(k: int, news: Callable[[int], Floats]) -> Floats | float:
-        return news(0) if (k - delay) % every == 0 else 0.0
+    def arriving_updates(tick_index: int, news: Callable[[int], Floats]) -> Floats | float:
+        return news(0) if (tick_index - delay) % every == 0 else 0.0
 
     def later(z: Floats, ticks: int, grip: Floats | None = None) -> Floats:
         sent = z[flight.size :].reshape(*messages, -1).copy()
@@ -178,8 +178,8 @@ def rms_growth(flight: LinearFlight, losses: Floats, *, states: int, time: float
     spread = np.sqrt(kept * (1.0 - kept))
     block = np.arange(len(flight.links) * len(losses)).reshape(-1, len(losses), 1) * states
 
-    def arriving_updates(k: int, news: Callable[[int], Floats]) -> Floats | float:
-        if (k - delay) % every:
+    def arriving_updates(tick_index: int, news: Callable[[int], Floats]) -> Floats | float:
+        if (tick_index - delay) % every:
             return 0.0
         change = news(0)
         # Of which other state each link has its noise: a rotation of those with the same loss. One rotation for all
@@ -235,22 +235,22 @@ def growth_rates_of_trials(flight: LinearFlight, net: Links, every: int) -> Floa
     fading, grip = np.zeros((L, _FLIGHTS), dtype=np.bool_), np.ones((L, _FLIGHTS))
     due, newest = np.full((late + 1, L, _FLIGHTS), -1), np.zeros((L, _FLIGHTS), dtype=np.int64)
 
-    def arriving_updates(k: int, news: Callable[[int], Floats]) -> Floats | float:
+    def arriving_updates(tick_index: int, news: Callable[[int], Floats]) -> Floats | float:
         # The message sent at tick k - delay is due in some ticks from now, or never.
         total: Floats | float = 0.0
-        due[(k - delay) % len(due)] = -1
-        if (k - delay) % flight.radio.every == 0:
+        due[(tick_index - delay) % len(due)] = -1
+        if (tick_index - delay) % flight.radio.every == 0:
             draw, wait = rng.random((2, L, _FLIGHTS))
             fading[:] = np.where(fading, draw >= net.recovers, draw < net.worsens)
             wait = (wait * (late + 1)).astype(np.int64)
-            due[(k - delay) % len(due)] = np.where(fading, -1, k + wait)
+            due[(tick_index - delay) % len(due)] = np.where(fading, -1, tick_index + wait)
         for waited in range(late + 1):  # the newest of those that arrive together
-            sent = k - delay - waited
-            now = (due[sent % len(due)] == k) & (sent > newest)
+            sent = tick_index - delay - waited
+            now = (due[sent % len(due)] == tick_index) & (sent > newest)
             if now.any():
                 newest[now] = sent
                 total = total + now * news(waited)
-        change = np.where(k - newest > net.silence / every, -every, every) / net.silence
+        change = np.where(tick_index - newest > net.silence / every, -every, every) / net.silence
         np.clip(grip + change, 0.0, 1.0, out=grip)
         return total
 

@@ -247,16 +247,16 @@ def _better_rows_and_work(rows: Floats, chosen: Ints) -> tuple[Ints, float]:
     return chosen, work
 
 
-def _best_swap(rows: Floats, chosen: Ints, t: float) -> tuple[int, int] | None:
-    """The exchange (position in chosen, row) that most lowers tr (M - t)^-1 and keeps M > t; None if none does.
+def _best_swap(rows: Floats, chosen: Ints, floor: float) -> tuple[int, int] | None:
+    """The exchange (position in chosen, row) that most lowers tr (M - floor)^-1 and keeps M > floor; None if none does.
 
-    Two rank-one updates of the inverse G = (M - t)^-1, for all pairs at once: first b comes, then a goes.
+    Two rank-one updates of the inverse G = (M - floor)^-1, for all pairs at once: first b comes, then a goes.
     """
     A = rows[chosen]
     r = A.shape[1]
     other = np.delete(np.arange(len(rows)), chosen)
     B = rows[other]
-    G = np.linalg.inv(product_in_blocks(A.T, A) - t * np.eye(r))
+    G = np.linalg.inv(product_in_blocks(A.T, A) - floor * np.eye(r))
     AG, BG = product_in_blocks(A, G), product_in_blocks(B, G)
     b1, b2 = 1 + (BG * B).sum(axis=1), (BG**2).sum(axis=1)
     top = np.argsort(-b2 / b1, kind="stable")[:_WORTH]

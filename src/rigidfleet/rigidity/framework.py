@@ -209,13 +209,13 @@ def sparse_flexes(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) ->
     return motions
 
 
-def _motion_of_least_speed_sum(c: Floats, V: Floats, n: int) -> Floats:
-    """The motion V a (n, d) with c a = 1 whose sum of speeds is least, by iteratively reweighted least squares."""
+def _motion_of_least_speed_sum(normaliser: Floats, V: Floats, n: int) -> Floats:
+    """Motion V a (n, d) with ``normaliser`` a = 1 of the least sum of speeds: iteratively reweighted least squares."""
     speed = np.ones(n)
     for sharp in np.logspace(0, -7, 20):
         weight = np.repeat(1 / (speed + sharp), len(V) // n)
-        a = np.linalg.solve(V.T @ (weight[:, None] * V), c)
-        motion = (V @ (a / (c @ a))).reshape(n, -1)
+        a = np.linalg.solve(V.T @ (weight[:, None] * V), normaliser)
+        motion = (V @ (a / (normaliser @ a))).reshape(n, -1)
         speed = np.linalg.norm(motion, axis=1)
     return motion
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigidfleet.rigidity.framework import Framework, sparse_flexes
-from rigidfleet.typing import Floats, Ints
+from rigidfleet.typing import Bools, Floats, Ints
 
 #: A stress blocks all flexes if its least energy exceeds this share of its greatest energy.
 _DEFINITE = 1e-7
@@ -215,7 +215,7 @@ def restore_lengths(p: Floats, edges: Ints, lengths: Floats, tol: float) -> Floa
 
 def descend_to_lengths(
     at: Floats, e: Ints, length: Floats, tol: float, iterations: int
-) -> tuple[Floats, np.ndarray]:
+) -> tuple[Floats, Bools]:
     """Levenberg-Marquardt from positions (B, N, d): final positions, and which of them have the lengths within tol."""
     at = at.copy()
     count, n, d = at.shape

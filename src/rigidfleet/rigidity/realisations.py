@@ -197,9 +197,9 @@ class _Groups:
         self.counts.append(count)
         return len(self.shapes) - 1
 
-    def flex_families(self, e: Ints) -> list[int]:
+    def flex_families(self, edges: Ints) -> list[int]:
         """Of each shape, the first one into which it bends while the edges (m, 2) keep their lengths; or itself."""
-        frames = [Framework(q, e) for q in self.shapes]
+        frames = [Framework(q, edges) for q in self.shapes]
         bend = [k for k, frame in enumerate(frames) if frame.flexes.size]
         first = list(range(len(frames)))
         for strides in STRIDES:

@@ -92,7 +92,9 @@ def judge_log(
     flown, drawn, estimate, alignment = _likely_flight(read, plan, doubts, judged)
     deviations = None if drawn is None else DrawnWays(flown, drawn)
     facts = uncertainty_facts(flown, deviations, estimate, alignment, doubts.clock)
-    verdict = verdict_with_intervals(assess(flown), deviations, facts, shared=doubts.clock != "own")
+    verdict = verdict_with_intervals(
+        assess(flown), deviations, facts, common_clock=doubts.clock != "own"
+    )
     flown.statistics["doubt"] = facts
     return flown, verdict
 

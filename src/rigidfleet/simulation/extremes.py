@@ -174,7 +174,7 @@ class CurveWatch:
         self._find_contacts(problem, work, state, np.arange(first, steps))
 
     def _find_contacts(
-        self, problem: Problem, work: Workspace, state: records.IntegratorState, some: Ints
+        self, problem: Problem, work: Workspace, state: records.IntegratorState, step_indices: Ints
     ) -> None:
         """Find the first contact of each kind in some steps (S,) of the trail, if there has been none before.
 
@@ -184,7 +184,7 @@ class CurveWatch:
             if name in self.touched or not self.worst[kind] < -_TOUCH:
                 continue
             deepest = partial(self._deepest_of_kind, kind, problem, work, state)
-            rows = _trail_rows(state, some)
+            rows = _trail_rows(state, step_indices)
             steps, points = state.trail.clock[rows], state.trail.points[rows]
             while steps[-1].sum() - steps[0, 0] > _INSTANT:
                 if len(steps) == 1:

@@ -214,14 +214,14 @@ class Leader:
         bandwidth = _SLOWING * float(a.b.min()) / (STEEPEST * fastest)
         return _RATES[best], min(bandwidth, _FOLLOWED / max(float(a.lag.max()), 1e-9))
 
-    def _room(self, r: Floats, ahead: Floats, a: AvoidanceArrays, seen: Ints) -> float:
-        """Least distance [m] of places r (K, N, 3) at times ahead (K,) [s] from what moves, beyond what is kept."""
+    def _room(self, r: Floats, times: Floats, a: AvoidanceArrays, seen: Ints) -> float:
+        """Least distance [m] of places r (K, N, 3) at times (K,) [s] ahead from what moves, beyond what is kept."""
         least = np.inf
         for o in seen:
             x, bound = a.sight.track[o], a.sight.bound[o]
-            away = r - (x[:3] + ahead[:, None] * x[3:])[:, None]
+            away = r - (x[:3] + times[:, None] * x[3:])[:, None]
             room = signed_distance(*local_point(*away.transpose(2, 0, 1), o, a.solids), o, a.solids)
-            room = room - (a.reach + a.spare) - (bound[0] + bound[1] / 3.0 * ahead)[:, None]
+            room = room - (a.reach + a.spare) - (bound[0] + bound[1] / 3.0 * times)[:, None]
             if (worst := float(room.min())) < least:
                 least, self.who = worst, int(np.unravel_index(room.argmin(), room.shape)[1])
         return least
@@ -385,7 +385,7 @@ class Leader:
         return rows, needed, who
 
     def _moving_obstacle_barriers(
-        self, o: int, r: Floats, v: Floats, rise: Floats, a: AvoidanceArrays
+        self, o: int, r: Floats, v: Floats, accels: Floats, a: AvoidanceArrays
     ) -> tuple[Floats, Floats]:
         """Normals (N, 3) of barriers of slots against obstacle o, which moves, and what they need (N,) along these.
 
@@ -404,12 +404,12 @@ class Leader:
         length = np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
         h = along + speed * s
         needed = -_CONE * h - speed**2 - speed * along / s
-        needed = (needed - (normal * rise).sum(axis=1)) / length
+        needed = (needed - (normal * accels).sum(axis=1)) / length
         nears = (along < 0.0) & (-along < _HORIZON * speed**2)
         return normal / length[:, None], np.where(nears, needed, -np.inf)
 
     def _still_barriers(
-        self, o: int, r: Floats, v: Floats, rise: Floats, a: AvoidanceArrays
+        self, o: int, r: Floats, v: Floats, accels: Floats, a: AvoidanceArrays
     ) -> tuple[Floats, Floats]:
         """Barriers of slots against obstacle o, which stands still; see `_moving_obstacle_barriers`."""
         solids = a.solids
@@ -422,4 +422,4 @@ class Leader:
         gap = away - a.reach - a.spare - np.maximum(0.0, -rate) * (self.period + a.lag)
         strength = _STEERING * a.share * a.b
         needed = needed_gap_acceleration(gap, rate, 0.0, strength, _EARLIER * a.rate)
-        return normal, needed - (normal * rise).sum(axis=1)
+        return normal, needed - (normal * accels).sum(axis=1)

@@ -329,11 +329,11 @@ def closeness_arrays(
 
 
 def _slot_references(
-    mission: Mission, pieces: Sequence[tuple[Floats, FollowedReferences]], tau: Floats | None
+    mission: Mission, pieces: Sequence[tuple[Floats, FollowedReferences]], clocks: Floats | None
 ) -> dict[str, Floats]:
     """Derivatives of the slots and the yaw of each vehicle, of pieces of a flight; NaN where no slots are tracked.
 
-    Yaw "along" continues from piece to piece. Where vehicles have clocks of their own, ``tau`` says how these stand;
+    Yaw "along" continues from piece to piece. Where vehicles have clocks of their own, ``clocks`` says how these stand;
     the yaw is that by their mean, from which they differ by far less than a vehicle needs to turn.
     """
     turned, n = commanded_yaw(mission), mission.n_agents
@@ -341,8 +341,8 @@ def _slot_references(
     last, until, end = None, 0.0, 0
     for times, followed in pieces:
         begin, end = end, end + len(times)
-        if followed and tau is not None:
-            ((_, reference, motion, turn),), own = followed, tau[begin:end]
+        if followed and clocks is not None:
+            ((_, reference, motion, turn),), own = followed, clocks[begin:end]
             states.append(slots_by_own_clocks(reference, motion, times, own)[:, 1:])
             off, rate = own[..., :2].mean(axis=1).T
             assert turn is not None  # vehicles fly

@@ -416,7 +416,7 @@ def _split_intervals(time: Floats, parts: Ints) -> Floats:
 
 
 def watch_curve(
-    watch: CurveWatch, curve: Piecewise, grid: Floats, spans: Sequence[Sequence[float]]
+    watch: CurveWatch, curve: Piecewise, grid: Floats, presence_spans: Sequence[Sequence[float]]
 ) -> dict[str, Extremum]:
     """Watch a curve (K, N, 3 or more, P), see `_watch_positions`, and return its greatest accelerations."""
     fastest: dict[str, Extremum] = {}
@@ -424,8 +424,8 @@ def watch_curve(
     for k in range(0, len(curve.pieces), together):  # in blocks, to save memory
         block = curve.slice_pieces(k, k + together)
         way = Piecewise(block.time, pad(block.pieces[:, :, :3], 2))
-        _watch_positions(watch, way, grid, spans)
-        here = presence(0.5 * (way.time[1:] + way.time[:-1]), spans, way.pieces.shape[1])
+        _watch_positions(watch, way, grid, presence_spans)
+        here = presence(0.5 * (way.time[1:] + way.time[:-1]), presence_spans, way.pieces.shape[1])
         way = Piecewise(way.time, way.pieces * here[..., None, None])
         _update_peak_accels(fastest, way, directed=watch.directed)
     return fastest

@@ -64,12 +64,12 @@ class Region(NamedTuple):
             return now, prism_distance(bound, np.maximum(low - least, greatest - high))
         return -now, -prism_distance(-bound, np.maximum(low - greatest, least - high))
 
-    def _depth(self, points: Floats, c: Floats, *, outside: bool) -> tuple[Floats, Floats]:
+    def _depth(self, points: Floats, middles: Floats, *, outside: bool) -> tuple[Floats, Floats]:
         """`curve_depths_and_bounds` as seen from above, of control points (M, 2, P) with middles (M, 2)."""
-        off = self._from_edges(c)
+        off = self._from_edges(middles)
         apart = np.linalg.norm(off, axis=2)
-        now = self._distance(off, c) * (1.0 if outside else -1.0)
-        spread = points - c[:, :, None]
+        now = self._distance(off, middles) * (1.0 if outside else -1.0)
+        spread = points - middles[:, :, None]
         reach = np.linalg.norm(spread, axis=1).max(axis=1)
         bound = now + reach
         kept = np.flatnonzero((now < 0.0) & (reach < -now))  # stays on the side where it should be
@@ -90,8 +90,8 @@ class Region(NamedTuple):
         share = np.clip((off * along).sum(axis=2) / squares, 0.0, 1.0)
         return off - share[..., None] * along
 
-    def _distance(self, off: Floats, x: Floats) -> Floats:
-        least = np.sqrt((off * off).sum(axis=2).min(axis=1))
+    def _distance(self, from_edges: Floats, x: Floats) -> Floats:
+        least = np.sqrt((from_edges * from_edges).sum(axis=2).min(axis=1))
         return np.where(self.covers(x), -least, least)
 
     def covers(self, x: Floats) -> Bools:

@@ -385,9 +385,9 @@ class Sweep:
         }
 
 
-def _group_or_number(column: SweepColumn, k: int) -> str | int:
+def _group_or_number(column: SweepColumn, number: int) -> str | int:
     """What grids share that take their values together: their group, or the column's own number."""
-    return getattr(column.variation, "group", "") or k
+    return getattr(column.variation, "group", "") or number
 
 
 @lru_cache(maxsize=4)

@@ -68,12 +68,12 @@ def build_command(part: str = "flight") -> list[str]:
     return [sys.executable, *flags, "-P", "-c", _BUILD.format(part), *path, home]
 
 
-def shipped_object_path(of: str, digest: str) -> Path:
+def shipped_object_path(cpu: str, digest: str) -> Path:
     """Where the package has the machine code of a level, made of sources with this digest."""
-    return Path(__file__).with_name(f"{of}-{digest}.so")
+    return Path(__file__).with_name(f"{cpu}-{digest}.so")
 
 
-def compile_objects(part: str, of: str) -> list[bytes] | None:
+def compile_objects(part: str, cpu: str) -> list[bytes] | None:
     """Objects of a part for a level, made by a process of its own; None if there can be no such process, or it fails.
 
     In that process Numba only translates. Otherwise it would optimise each function before all are optimised
@@ -81,8 +81,8 @@ def compile_objects(part: str, of: str) -> list[bytes] | None:
     """
     # Numba's coloured messages about the versions that it tries are suppressed.
     settings = {"NUMBA_OPT": "0", "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
-    if of != HOST:
-        settings[KEY] = of
+    if cpu != HOST:
+        settings[KEY] = cpu
     if sys.executable:
         with suppress(OSError):
             done = subprocess.run(

@@ -471,9 +471,9 @@ def _operations_in_order(symbols: Iterable[Symbol]) -> list[Symbol]:
     return sorted((x for x in symbols if x.operation not in SOURCES), key=lambda x: x.serial)
 
 
-def _distinct_symbols(values: Iterable[Any], known: range) -> list[Symbol]:
+def _distinct_symbols(values: Iterable[Any], knowledge: range) -> list[Symbol]:
     """The different symbols among values of which so much is known."""
-    symbols = (x for x in values if isinstance(x, Symbol) and x.known in known)
+    symbols = (x for x in values if isinstance(x, Symbol) and x.known in knowledge)
     return list({x.serial: x for x in symbols}.values())
 
 

@@ -233,7 +233,7 @@ class Pilot:
         """The balls that are there."""
         return [ball for ball in self.balls if ball.until is None]
 
-    def ball_at_slot(self, slot: int) -> Ball:
+    def ball_at_slot(self, page_slot: int) -> Ball:
         """The ball that has a slot of the page.
 
         Raises
@@ -242,20 +242,20 @@ class Pilot:
             There is none.
         """
         for ball in self.flying_balls:
-            if ball.slot == slot:
+            if ball.slot == page_slot:
                 return ball
         raise ValueError("this ball is gone")
 
-    def pull_ball(self, slot: int, goal: Floats | None) -> None:
+    def pull_ball(self, page_slot: int, goal: Floats | None) -> None:
         """Draw a ball to a goal (3,) [m], or let go of it: it stays where it is."""
-        ball = self.ball_at_slot(slot)
+        ball = self.ball_at_slot(page_slot)
         ball.goal = goal
         if goal is None:
             ball.set_velocity(np.zeros(3))
 
-    def remove_ball(self, slot: int) -> None:
+    def remove_ball(self, page_slot: int) -> None:
         """Remove a ball."""
-        ball = self.ball_at_slot(slot)
+        ball = self.ball_at_slot(page_slot)
         self.moved = True
         if ball.turns:
             ball.until = self.t

@@ -100,20 +100,20 @@ def _area_rings(mission: Mission) -> list[dict[str, Any]]:
     ]
 
 
-def page_samples(result: Result, shown: Ints, tension: float) -> dict[str, PackedColumn]:
-    """Samples for the page, at the result's times; ``shown`` are the edges drawn."""
+def page_samples(result: Result, edges: Ints, max_tension: float) -> dict[str, PackedColumn]:
+    """Samples for the page, at the result's times; ``edges`` are those drawn."""
     mission = result.mission
     # Fine enough for a vehicle that fills the screen.
     fine = max(typical_formation_radius(result), *mission.agents.radius, 1e-9) / 20_000
     return {
         "position": PackedColumn(result.position, fine),
         **dict(_attitude_columns(result)),
-        **dict(_optional_columns(result, shown, fine)),
+        **dict(_optional_columns(result, edges, fine)),
         "slot": PackedColumn(result.slot_position - result.position, fine),
         "cm": PackedColumn(result.cm, fine),
         "attitude": PackedColumn(result.attitude, 1e-4),
         "reference": PackedColumn(result.attitude_reference, 1e-4),
-        "tension": PackedColumn(_tensions(result, shown), tension / 1000),
+        "tension": PackedColumn(_tensions(result, edges), max_tension / 1000),
         **{plot["column"]: samples for plot, samples in _plots(result)},
     }
 
