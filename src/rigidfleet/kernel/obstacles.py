@@ -57,9 +57,9 @@ nearest_along = compiled_copy(distance_to_box, "nearest_along", tangent_of_box=s
 
 
 @jit
-def distance_to_height_map(curve, b, floor, pieces, s):
+def distance_to_height_map(curve, b, to_beat, pieces, s):
     """The same for a height map: the least over its triangles near the curve, and inside the depth at five points."""
-    best, at = floor, -1.0
+    best, at = to_beat, -1.0
     x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], ball_radius(curve)
     node, last = s.first[b, 0], s.last[b, 0]
     while node < last:
