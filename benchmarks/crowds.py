@@ -189,7 +189,7 @@ def swap(
         state.force[:] = asked(r, v, -start)
         state.work.law_time[0] = t
         begun = time.process_time()
-        if not sampled.guard_forces(problem, work, flight, state, a):
+        if not sampled.correct_forces(problem, work, flight, state, a):
             raise SystemExit("too many neighbours")
         took = time.process_time() - begun
         c = state.force.copy()
@@ -231,7 +231,7 @@ def layers(n: int = 30, repeats: int = 5) -> tuple[float, float, float]:
             state.seen[:, :3], state.seen[:, 3:] = r, v
             state.force[:] = asked(r, v, -states[0][0])
             begun = time.process_time()
-            sampled.guard_forces(problem, work, flight, state, a)
+            sampled.correct_forces(problem, work, flight, state, a)
             cost += time.process_time() - begun
         found.append(1e6 * cost / (repeats * len(states) * n))
     return found[0], found[1] - found[0], found[2] - found[0]

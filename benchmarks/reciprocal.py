@@ -38,7 +38,7 @@ def guarded(goal: Floats) -> Law:
     def law(_t: float, r: Floats, v: Floats) -> tuple[Floats, float]:
         state.seen[:, :3], state.seen[:, 3:], state.force[:] = r, v, asked(r, v, goal)
         begun = time.process_time()
-        assert sampled.guard_forces(problem, work, flight, state, a)
+        assert sampled.correct_forces(problem, work, flight, state, a)
         return state.force.copy(), time.process_time() - begun
 
     return law

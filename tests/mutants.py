@@ -484,7 +484,7 @@ def fly_with(plain: str) -> None:
         flight, state, avoidance = (of[x] for x in addresses[:3])
         problem, work = (of[int(x)] for x in avoidance.law)
         with np.errstate(all="ignore"):
-            return int(guard.guard_forces(problem, work, flight, state, avoidance))
+            return int(guard.correct_forces(problem, work, flight, state, avoidance))
 
     watching: Any = native.Watch
     watching.search_clearances = search_clearances

@@ -208,7 +208,7 @@ def test_barriers_change_accelerations_as_exact_solvers_do(seed, solve):
     for ask in (20.0 * (r.mean(axis=0) - r), wanted):
         a.hold[:], state.force[:] = hold, m[:, None] * ask
         assert (a.last > 0.0).any() == (ask is wanted)  # the search begins with other pushes
-        assert sampled.guard_forces(problem, work, flight, state, a)
+        assert sampled.correct_forces(problem, work, flight, state, a)
     # The same problem from its definition
     rows, needed, most = [], [], []
     for e, (i, j) in enumerate(edges):

@@ -64,7 +64,7 @@ class Crowd:
         s.seen[:, :3], s.seen[:, 3:] = r, v
         s.force[:] = a.weight[:, None] * (np.asarray(asked) + [0.0, 0.0, a.g])
         s.work.law_time[0] = t
-        assert sampled.guard_forces(self.problem, self.work, self.flight, s, a)
+        assert sampled.correct_forces(self.problem, self.work, self.flight, s, a)
         return s.force / a.weight[:, None] - [0.0, 0.0, a.g]
 
 

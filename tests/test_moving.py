@@ -40,7 +40,7 @@ class One:
         """The acceleration (3,) that is given at t [s] for one asked for."""
         self.state.seen[0, :3], self.state.seen[0, 3:], self.state.force[0] = r, v, force
         self.state.work.law_time[0] = t
-        assert sampled.guard_forces(self.problem, self.work, self.flight, self.state, self.a)
+        assert sampled.correct_forces(self.problem, self.work, self.flight, self.state, self.a)
         return self.state.force[0].copy()
 
 

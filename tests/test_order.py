@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 import rigidfleet as rf
 from rigidfleet.planning.body_layer import (
     Detour,
-    least_norm_solution,
+    least_norm_feasible,
     nearest_accelerations,
     rigid_motion_rows,
 )
@@ -186,8 +186,8 @@ def test_the_body_is_steered_as_an_independent_solver_would(seed):
 
 def test_contradictory_rows_have_no_least_distance():
     """x >= 1 and -x >= 1: no motion of the body satisfies both, and none is made up."""
-    assert least_norm_solution(np.array([[1.0], [-1.0]]), np.ones(2)) is None
-    assert least_norm_solution(np.array([[1.0], [2.0]]), np.array([1.0, 3.0])) == pytest.approx(
+    assert least_norm_feasible(np.array([[1.0], [-1.0]]), np.ones(2)) is None
+    assert least_norm_feasible(np.array([[1.0], [2.0]]), np.array([1.0, 3.0])) == pytest.approx(
         [1.5]
     )
 

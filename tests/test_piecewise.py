@@ -68,7 +68,7 @@ def test_hermite_meets_all_derivatives(orders):
     krogh = KroghInterpolator(ends, states[:, :2].swapaxes(0, 1).reshape(-1, 3))
     t = np.linspace(*TIME[:2], 7)
     np.testing.assert_allclose(curve.at(t), krogh(t), rtol=1e-8, atol=1e-8)
-    apart = Piecewise.of_ends(TIME, states[:, :-1] + 1.0, states[:, 1:])
+    apart = Piecewise.of_end_states(TIME, states[:, :-1] + 1.0, states[:, 1:])
     np.testing.assert_allclose(apart.piece_end_states(orders)[0], states[:, :-1] + 1.0, atol=1e-9)
     np.testing.assert_allclose(apart.jumps(orders), 1.0, rtol=1e-7)
 

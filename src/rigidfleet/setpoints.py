@@ -106,7 +106,7 @@ def ways_of(samples: Setpoints, agents: slice) -> Piecewise:
     state = samples.state[:, :, agents].swapaxes(0, 1)
     yaw = np.stack([samples.yaw[:, agents], samples.yaw_rate[:, agents]])[..., None]
     position, turned = (
-        Piecewise.of_ends(knots, x[:, first], x[:, first + 1]) for x in (state, yaw)
+        Piecewise.of_end_states(knots, x[:, first], x[:, first + 1]) for x in (state, yaw)
     )
     return position.stack(turned)
 

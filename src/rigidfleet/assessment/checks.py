@@ -162,7 +162,7 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
             held = p.distances <= limit
             words = f"{value(p.distances, 'm')} off (limit {value(limit, 'm')})"
             words = f"the worst of the {len(edges)} edges of '{p.formation}' is {words}"
-            yield _check_at_end(p, "distances", held, words, p.distances, limit, "m")
+            yield _result_at_end(p, "distances", held, words, p.distances, limit, "m")
         if i not in measured.fits_at_end:
             continue
         fit = measured.fits_at_end[i]
@@ -182,10 +182,10 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
             words = f"'{p.formation}' is {state} {wanted}: all {len(edges)} edges hold, yet {words}"
         else:
             words = f"'{p.formation}' is {'' if passed else 'not '}reached: {words}"
-        yield _check_at_end(p, "shape", passed, words, fit.error, fit.limit, "m", who=who)
+        yield _result_at_end(p, "shape", passed, words, fit.error, fit.limit, "m", who=who)
         if fit.in_order is not None:
             words = f"the agents of '{p.formation}' are {'' if fit.in_order else 'not '}in order"
-            yield _check_at_end(p, "order", fit.in_order, words)
+            yield _result_at_end(p, "order", fit.in_order, words)
         if not passed:
             continue  # handedness and side mean nothing for a wrong shape
         if p.handedness is not None:
@@ -194,21 +194,21 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
                 if fit.is_mirrored
                 else "has the intended handedness"
             )
-            yield _check_at_end(p, "handedness", p.handedness, f"'{p.formation}' {words}")
+            yield _result_at_end(p, "handedness", p.handedness, f"'{p.formation}' {words}")
         if p.flip is not None:
             what = "normal" if fit.dimension == 2 else "direction"
             flipped = "has flipped" if p.flip > FLIPPED else "has not flipped"
             words = f"{what} is {value(p.flip, 'deg')} from where it should point"
             words = f"'{p.formation}' {flipped}: its {words}"
-            yield _check_at_end(p, "flip", p.flip <= FLIPPED, words, p.flip, FLIPPED, "deg")
+            yield _result_at_end(p, "flip", p.flip <= FLIPPED, words, p.flip, FLIPPED, "deg")
 
 
-def _check_at_end(
-    p: PhaseVerdict, check: str, passed: bool, words: str, *judged: Any, who: str = ""
+def _result_at_end(
+    p: PhaseVerdict, check: str, passed: bool, message: str, *judged: Any, who: str = ""
 ) -> CheckResult:
-    """A finding about the end of a phase; ``judged``: the worst value, its limit and their unit."""
-    words = f"at the end of phase '{p.name}' ({p.t_end:.2f} s) {words}"
-    return CheckResult(check, passed, words, *judged, when=p.t_end, who=who, phase=p.name)
+    """The result of a check at the end of a phase; ``judged``: the worst value, its limit and their unit."""
+    message = f"at the end of phase '{p.name}' ({p.t_end:.2f} s) {message}"
+    return CheckResult(check, passed, message, *judged, when=p.t_end, who=who, phase=p.name)
 
 
 def _waypoint_checks(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
@@ -247,7 +247,7 @@ def _touch_down_checks(measured: Measurements, phases: list[PhaseVerdict]) -> It
         low = np.flatnonzero(measured.left[k] & (measured.closeness.each[k] <= PAD))
         low = low[measured.obstacles_stood_on(np.full(len(low), k), low).any(axis=0)]
         if not len(low):
-            yield _check_at_end(p, "touch_down", False, "no vehicle is on the ground")
+            yield _result_at_end(p, "touch_down", False, "no vehicle is on the ground")
             continue
         worst = int(low[down[low].argmax()])
         who, speed = f"agent {worst + 1}", max(0.0, float(down[worst]))
@@ -255,7 +255,7 @@ def _touch_down_checks(measured: Measurements, phases: list[PhaseVerdict]) -> It
         if (off := int(np.isfinite(measured.result.motors_off).sum())) > 0:
             words += f"; {off} vehicle{'s' if off > 1 else ''} may switch off"
         judged = speed <= TOUCH_DOWN, words, speed, TOUCH_DOWN, "m/s"
-        yield _check_at_end(p, "touch_down", *judged, who=who)
+        yield _result_at_end(p, "touch_down", *judged, who=who)
 
 
 def _velocity_jump_check(measured: Measurements) -> Iterator[CheckResult]:

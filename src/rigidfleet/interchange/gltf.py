@@ -164,7 +164,7 @@ def read_gltf(data: bytes) -> list[Piecewise]:
         before, at, after = (_y_up_to_z_up(x) for x in values.reshape(-1, 3, 3).swapaxes(0, 1))
         begin, end = np.stack([at[:-1], after[:-1]]), np.stack([at[1:], before[1:]])
         yaw = np.unwrap(2.0 * np.arctan2(quaternions[:, 1], quaternions[:, 3]))
-        way = Piecewise.of_ends(time[:, 0], begin, end)
+        way = Piecewise.of_end_states(time[:, 0], begin, end)
         curves.append(with_headings(way, times[:, 0], yaw))
     return curves
 

@@ -66,7 +66,7 @@ def swap_in_measured_states(t, disturbance, w):
 
 
 @jit_inline
-def ground_contact(m, g, floor, z):
+def ground_damping_and_lift(m, g, floor, z):
     """Damping [N s/m] and upward force [N] of the ground on a lost vehicle of mass m [kg] at height z [m].
 
     In equilibrium with its weight, the vehicle just touches the ground, at the height ``floor`` [m].
@@ -99,7 +99,7 @@ def restore_states_and_disturb(t, m, g, disturbance, w):
         if disturbance.lost[i]:
             over = height_below(w.r[i, 0], w.r[i, 1], w.r[i, 2], disturbance.roofs)
             floor = max(disturbance.floor[i], over + disturbance.radius[i])
-            damping, lift = ground_contact(true, g, floor, w.r[i, 2])
+            damping, lift = ground_damping_and_lift(true, g, floor, w.r[i, 2])
             for q in range(3):
                 w.f_u[i, q] = 0.0
                 w.f_E[i, q] -= damping * w.v[i, q]

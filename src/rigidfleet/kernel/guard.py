@@ -560,7 +560,7 @@ def move_to_lag_free_point(i, vehicles, state, r, v, a):
 
 
 @jit
-def guard_forces(p, w, flight, state, a):
+def correct_forces(p, w, flight, state, a):
     """Filter and guard the forces that the formation's law has just given; returns 0 if neighbours are too many."""
     n, lost, t = a.b.shape[0], flight.vehicles.lost, state.work.law_time[0]
     r, v, k = a.known[0], a.known[1], state.count[FLIGHT_TICKS]

@@ -88,7 +88,7 @@ def store_if_worse(kind, value, t, first, second, monitor):
 
 
 @jit
-def quaternion_rate_and_length(points, p):
+def quaternion_extremes(points, p):
     """Greatest rate, over a step, and least length of the quaternion of the body axes, by its control points."""
     first = 6 * p.vehicles.m.shape[0] + p.graph.edges.shape[0]
     fastest, least = 0.0, math.inf
@@ -106,7 +106,7 @@ def frame_rotation_bound(points, p):
     """Upper bound of the rotation [rad] of the axes of the states over a step: 0 in the inertial formulation."""
     if not p.body_formulation:
         return 0.0
-    rate, length = quaternion_rate_and_length(points, p)
+    rate, length = quaternion_extremes(points, p)
     return 2.0 * rate / max(length, 1e-3)
 
 
@@ -258,7 +258,7 @@ def bound_distance_changes(p, state, monitor):
     if p.body_formulation:
         # The axes turn as well, and where the vertical is in them is not asked: any rotation may tilt. A quaternion
         # between its control points may be shorter than they are, hence the tenth.
-        rate, length = quaternion_rate_and_length(points, p)
+        rate, length = quaternion_extremes(points, p)
         turn = math.sqrt(turn_x * turn_x + turn_y * turn_y + turn_z * turn_z)
         tilt = 2.0 * rate / max(length - 0.1, 0.1) + turn
     # Of two agents, each may move by its part, and tilting moves each by at most its distance from the mean.
@@ -280,14 +280,14 @@ def enclose_agents(points, monitor):
 
 
 @jit
-def surely_apart(i, j, axes, reach, monitor):
-    """Whether agents i and j stay at least ``reach`` [m] apart over a step, by their balls, along the first ``axes``.
+def surely_apart(i, j, n_axes, reach, monitor):
+    """Whether agents i and j stay at least ``reach`` [m] apart over a step, by balls, in the first ``n_axes`` axes.
 
     If so, their curves need not be compared. False does not say that they come closer.
     """
     balls = monitor.balls
     far, reach = 0.0, reach + balls[i, 3] + balls[j, 3] + CLOSE
-    for q in range(axes):
+    for q in range(n_axes):
         x = balls[i, q] - balls[j, q]
         far += x * x
     return reach > 0.0 and far >= reach * reach

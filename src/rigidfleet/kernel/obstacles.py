@@ -40,12 +40,12 @@ _SHORTEST = 2.0**-32
 
 
 @jit
-def solid_gap_and_normal(x, y, z, b, triangle, s):
+def solid_gap_and_normal(x, y, z, b, triangle, solids):
     """As `bernstein.tangent_of_box`, of solid b, or of one of its triangles if that is not -1."""
     if triangle < 0:
-        nx, ny, nz = outward_normal(x, y, z, b, s)
-        return signed_distance(x, y, z, b, s), nx, ny, nz
-    nx, ny, nz, squared = vector_from_triangle(x, y, z, s.triangles[triangle])
+        nx, ny, nz = outward_normal(x, y, z, b, solids)
+        return signed_distance(x, y, z, b, solids), nx, ny, nz
+    nx, ny, nz, squared = vector_from_triangle(x, y, z, solids.triangles[triangle])
     away = math.sqrt(squared)
     if away == 0.0:
         return 0.0, 0.0, 0.0, 0.0
@@ -57,24 +57,24 @@ nearest_along = compiled_copy(distance_to_box, "nearest_along", tangent_of_box=s
 
 
 @jit
-def distance_to_height_map(curve, b, to_beat, pieces, s):
+def distance_to_height_map(curve, b, to_beat, pieces, solids):
     """The same for a height map: the least over its triangles near the curve, and inside the depth at five points."""
     best, at = to_beat, -1.0
     x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], ball_radius(curve)
-    node, last = s.first[b, 0], s.last[b, 0]
+    node, last = solids.first[b, 0], solids.last[b, 0]
     while node < last:
-        if box_distance(x, y, z, s.nodes[node]) - span >= best:
-            node = s.after[node]
+        if box_distance(x, y, z, solids.nodes[node]) - span >= best:
+            node = solids.after[node]
             continue
-        for triangle in range(s.leaf[node, 0], s.leaf[node, 1]):
-            value, place = nearest_along(curve, b, triangle, best, pieces, s)
+        for triangle in range(solids.leaf[node, 0], solids.leaf[node, 1]):
+            value, place = nearest_along(curve, b, triangle, best, pieces, solids)
             if place >= 0.0:
                 best, at = value, place
         node += 1
     for k in range(5):
         share = 0.25 * k
         x, y, z = point_at(curve, share)
-        value = signed_distance(x, y, z, b, s)
+        value = signed_distance(x, y, z, b, solids)
         if value < best:
             best, at = value, share
     return best, at
@@ -95,70 +95,70 @@ def cut_curve(curve, start, end, work, out):
 
 
 @jit
-def curve_in_solid_axes(curve, t, h, b, s, out):
+def curve_in_solid_axes(curve, t, h, b, solids, out):
     """Control points (5, 3) in the axes of solid b, which moves straight from t to t + h."""
-    x0, y0, z0 = solid_displacement(t, b, s)
-    x1, y1, z1 = solid_displacement(t + h, b, s)
+    x0, y0, z0 = solid_displacement(t, b, solids)
+    x1, y1, z1 = solid_displacement(t + h, b, solids)
     for k in range(5):
         share = 0.25 * k
         x = curve[k, 0] - (x0 + share * (x1 - x0))
         y = curve[k, 1] - (y0 + share * (y1 - y0))
         z = curve[k, 2] - (z0 + share * (z1 - z0))
-        out[k, 0], out[k, 1], out[k, 2] = local_point(x, y, z, b, s)
+        out[k, 0], out[k, 1], out[k, 2] = local_point(x, y, z, b, solids)
 
 
 @jit
-def point_in_solid_axes(x, y, z, t, b, s):
+def point_in_solid_axes(x, y, z, t, b, solids):
     """Coordinates of a point of the world in the axes of solid b at time t [s]."""
-    u, v, w = solid_displacement(t, b, s)
-    return local_point(x - u, y - v, z - w, b, s)
+    u, v, w = solid_displacement(t, b, solids)
+    return local_point(x - u, y - v, z - w, b, solids)
 
 
 @jit
-def watch_solid(i, b, curve, t, h, s, monitor):
+def watch_solid(i, b, curve, t, h, solids, monitor):
     """Clearance of agent i's surface to solid b over a piece of a step."""
     radius, part, own = monitor.radius[i], monitor.curves[1], monitor.curves[2]
-    start, stop, way, last = 0.0, 1.0, s.first[b, 3], s.last[b, 3]
-    if s.there[b, 0] > t:
-        start = (s.there[b, 0] - t) / h
-    if s.there[b, 1] < t + h:
-        stop = (s.there[b, 1] - t) / h
+    start, stop, way, last = 0.0, 1.0, solids.first[b, 3], solids.last[b, 3]
+    if solids.there[b, 0] > t:
+        start = (solids.there[b, 0] - t) / h
+    if solids.there[b, 1] < t + h:
+        stop = (solids.there[b, 1] - t) / h
     while start < stop:
         end = stop
-        while way < last and s.times[way] <= t + start * h:
+        while way < last and solids.times[way] <= t + start * h:
             way += 1
-        if way < last and s.times[way] < t + h:
-            end = min(stop, max((s.times[way] - t) / h, start + _SHORTEST))
+        if way < last and solids.times[way] < t + h:
+            end = min(stop, max((solids.times[way] - t) / h, start + _SHORTEST))
         if start > 0.0 or end < 1.0:
             cut_curve(curve, start, end, monitor.scratch[2], part)
-            curve_in_solid_axes(part, t + start * h, (end - start) * h, b, s, own)
+            curve_in_solid_axes(part, t + start * h, (end - start) * h, b, solids, own)
         else:
-            curve_in_solid_axes(curve, t, h, b, s, own)
+            curve_in_solid_axes(curve, t, h, b, solids, own)
         x, y, z = own[2, 0], own[2, 1], own[2, 2]
-        floor = clearance_to_beat(i, monitor) + radius
-        if not (floor < math.inf and distance_bound(x, y, z, b, s) - ball_radius(own) >= floor):
-            if s.kind[b] == HEIGHTS:
-                value, at = distance_to_height_map(own, b, floor, monitor.pieces, s)
+        floor, span = clearance_to_beat(i, monitor) + radius, ball_radius(own)
+        if not (floor < math.inf and distance_bound(x, y, z, b, solids) - span >= floor):
+            if solids.kind[b] == HEIGHTS:
+                value, at = distance_to_height_map(own, b, floor, monitor.pieces, solids)
             else:
-                value, at = nearest_along(own, b, -1, floor, monitor.pieces, s)
+                value, at = nearest_along(own, b, -1, floor, monitor.pieces, solids)
             if at >= 0.0:
                 share = start + at * (end - start)
                 x, y, z = point_at(curve, share)
-                above = is_solid_below(x, y, z, b, s)
+                above = is_solid_below(x, y, z, b, solids)
                 store_clearance(value - radius, t + share * h, i, b, above, monitor)
         start = end
 
 
 @jit
-def distance_bound(x, y, z, b, s):
+def distance_bound(x, y, z, b, solids):
     """Lower bound of the distance of a point from solid b, in its axes: that from the box around it."""
-    if s.leaf.shape[0] > 0 and s.last[b, 0] > s.first[b, 0]:
-        return box_distance(x, y, z, s.size[b])
-    return signed_distance(x, y, z, b, s)
+    if solids.leaf.shape[0] > 0 and solids.last[b, 0] > solids.first[b, 0]:
+        return box_distance(x, y, z, solids.size[b])
+    return signed_distance(x, y, z, b, solids)
 
 
 @jit
-def watch_lift_off(i, curve, t, s, monitor):
+def watch_departure(i, curve, t, s, monitor):
     """At the end (time t) of a step, tell whether agent i has left all obstacles below it."""
     if not (monitor.standing[i] != 0 or monitor.low[i, 0] < math.inf):
         return
@@ -176,7 +176,7 @@ def watch_lift_off(i, curve, t, s, monitor):
 
 
 @jit
-def watch_clearances(points, start, length, p, s, monitor):
+def watch_clearances(points, start, length, p, solids, monitor):
     """Take the clearances of a step from ``start`` of a ``length`` [s]: control points (5, n) of the states."""
     curve, parts = monitor.curves[0], count_pieces(frame_rotation_bound(points, p))
     h = length / parts
@@ -188,7 +188,7 @@ def watch_clearances(points, start, length, p, s, monitor):
             if not monitor.left[i]:
                 continue
             world_control_points(points, i, 0, p, monitor, curve)
-            for b in range(s.kind.shape[0]):
-                watch_solid(i, b, curve, t, h, s, monitor)
+            for b in range(solids.kind.shape[0]):
+                watch_solid(i, b, curve, t, h, solids, monitor)
             if part == parts - 1:
-                watch_lift_off(i, curve, t + h, s, monitor)
+                watch_departure(i, curve, t + h, solids, monitor)

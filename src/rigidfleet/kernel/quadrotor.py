@@ -9,7 +9,7 @@ import math
 
 from rigidfleet.kernel.aerodynamics import ground_effect_factor
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
-from rigidfleet.kernel.disturbances import ground_contact
+from rigidfleet.kernel.disturbances import ground_damping_and_lift
 from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.rigid_body import attitude_matrix, quaternion_rate
 from rigidfleet.kernel.vectors import as_lanes
@@ -49,7 +49,7 @@ def quadrotor_derivative(y, command, i, vehicles, around, air, push, T, dy):
     damping, lift = 0.0, 0.0
     if vehicles.lost[i]:
         over = height_below(y[0], y[1], y[2], around.roofs) + around.radius[i]
-        damping, lift = ground_contact(m, vehicles.g, max(around.floor[i], over), y[2])
+        damping, lift = ground_damping_and_lift(m, vehicles.g, max(around.floor[i], over), y[2])
     if vehicles.point[i]:
         point_derivative(y, command, i, vehicles, air, push, dy)
     else:

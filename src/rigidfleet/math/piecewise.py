@@ -33,10 +33,10 @@ class Piecewise(NamedTuple):
     @classmethod
     def hermite(cls, time: Floats, states: Floats) -> Piecewise:
         """Through states (m, K + 1, ...) at knots (K + 1,) [s]: m derivatives, 1 to 4, are met by degree 2 m - 1."""
-        return cls.of_ends(time, states[:, :-1], states[:, 1:])
+        return cls.of_end_states(time, states[:, :-1], states[:, 1:])
 
     @classmethod
-    def of_ends(cls, time: Floats, begin: Floats, end: Floats) -> Piecewise:
+    def of_end_states(cls, time: Floats, begin: Floats, end: Floats) -> Piecewise:
         """The same, from m derivatives (m, K, ...) at the beginning and at the end of each piece."""
         return cls(time, hermite_pieces(np.diff(time), begin, end))
 

@@ -26,13 +26,13 @@ def is_semidefinite(weight: Floats) -> bool:
     return bool(np.linalg.eigvalsh(weight)[0] >= -ROUNDING * np.abs(weight).max())
 
 
-def cost_to_go(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
-    """P (..., n, n) at times to go tau (...).
+def cost_to_go(A: Floats, G: Floats, Q: Floats, S: Floats, to_go: Floats) -> Floats:
+    """P (..., n, n) at times to go (...).
 
     Raises ValueError if P does not exist at all times to go until the greatest, or cannot be computed.
     """
-    grows = _needs_small_steps(A, G, Q, S, tau.max(initial=0.0))
-    return _march_costs(A, G, Q, S, tau)[0] if grows else _costs_by_doubling(A, G, Q, S, tau)
+    grows = _needs_small_steps(A, G, Q, S, to_go.max(initial=0.0))
+    return _march_cost(A, G, Q, S, to_go)[0] if grows else _costs_by_doubling(A, G, Q, S, to_go)
 
 
 def costs_and_states(
@@ -42,18 +42,18 @@ def costs_and_states(
 
     Raises ValueError as `cost_to_go` does.
     """
-    tau = np.maximum(T - t, 0.0)
+    to_go = np.maximum(T - t, 0.0)
     if _needs_small_steps(A, G, Q, S, T):
-        P, x = (part[:-1] for part in _march_costs(A, G, Q, S, np.append(tau, T)))
+        P, x = (part[:-1] for part in _march_cost(A, G, Q, S, np.append(to_go, T)))
         return P, x
-    P = _costs_by_doubling(A, G, Q, S, tau)
+    P = _costs_by_doubling(A, G, Q, S, to_go)
     X, Phi, W, _ = _hamiltonian_flow(A, G, Q, S, t, T)
     return P, solve_linear(np.eye(len(A)) + W @ (P - X), Phi)
 
 
-def _costs_by_doubling(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
-    """P (..., n, n) at times to go tau (...), from the flow of `_transition_and_gramians`."""
-    X, Phi, W, V = _hamiltonian_flow(A, G, Q, S, tau, tau.max(initial=0.0))
+def _costs_by_doubling(A: Floats, G: Floats, Q: Floats, S: Floats, to_go: Floats) -> Floats:
+    """P (..., n, n) at times to go (...), from the flow of `_transition_and_gramians`."""
+    X, Phi, W, V = _hamiltonian_flow(A, G, Q, S, to_go, to_go.max(initial=0.0))
     D = S - X
     P = X + V + _transpose(Phi) @ solve_linear(np.eye(len(A)) + D @ W, D @ Phi)
     return 0.5 * (P + _transpose(P))
@@ -78,8 +78,8 @@ def _needs_small_steps(A: Floats, G: Floats, Q: Floats, S: Floats, T: float) -> 
     return not float(np.abs(Phi).max()) <= _GROWTH  # true for NaN
 
 
-def _march_costs(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tuple[Floats, Floats]:
-    """P and x (..., n, n) at times to go tau (...), in steps that each keep P positive.
+def _march_cost(A: Floats, G: Floats, Q: Floats, S: Floats, to_go: Floats) -> tuple[Floats, Floats]:
+    """P and x (..., n, n) at times to go (...), in steps that each keep P positive.
 
     Columns of x are the states that each state alone, at the greatest time to go, leads to. Raises ValueError if there
     are too many steps.
@@ -87,7 +87,7 @@ def _march_costs(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tup
     identity, rate = np.eye(len(A)), _fastest_rate(A, G, Q)
     P, costs, moves = S, [], []
     steps = 0
-    every, which = np.unique(tau, return_inverse=True)
+    every, which = np.unique(to_go, return_inverse=True)
     for span in np.diff(every, prepend=0.0):
         left = max(1, math.ceil(span * rate / math.log(_GROWTH)))
         Phi, W, V, _ = _transition_and_gramians(A, G, Q, np.array(span / left), rate)
@@ -112,7 +112,7 @@ def _march_costs(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tup
     states = [identity]
     for move in moves[:0:-1]:  # each leads x at its time to go to x at the one before
         states.append(move @ states[-1])
-    where = which.reshape(tau.shape)
+    where = which.reshape(to_go.shape)
     return np.array(costs)[where], np.array(states[::-1])[where]
 
 

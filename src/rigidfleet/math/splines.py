@@ -83,7 +83,7 @@ def snap_cost(pieces: Floats, knots: Floats) -> float:
     )
 
 
-def least_snap_times(total: float, x: Floats, *state: Floats) -> Floats:
+def least_snap_knots(total: float, x: Floats, *state: Floats) -> Floats:
     """Times (n + 1,) [s] from 0 to ``total`` at points x (n + 1, d) that make the snap of `minimum_snap` least.
 
     ``state`` are its arguments after the points. From times that grow with the square root of each distance, by a

@@ -148,12 +148,12 @@ class Boundaries:
         early = np.maximum(last - tau, tau - first)
         reach = spread[:, :1] + spread[:, 1:] * falls.drag_integrals(k, last)[0] + speed * early
 
-        def least_nearness(away: Floats, way: Floats) -> Floats:
-            return 0.5 * (away[:, 1:] + away[:, :-1] - way).min(axis=1)
+        def least_distance(distance: Floats, length: Floats) -> Floats:
+            return 0.5 * (distance[:, 1:] + distance[:, :-1] - length).min(axis=1)
 
         way = speed * np.diff(tau, axis=1)
         more = (speed + spread[:, 1:]) * (np.diff(tau, axis=1) + early[:, 1:] + early[:, :-1])
-        return -least_nearness(away, way), np.full(len(m), 0.5), -least_nearness(away - reach, more)
+        return -least_distance(away, way), np.full(len(m), 0.5), -least_distance(away - reach, more)
 
 
 def _distance_outside(region: Region, inclusion: bool, points: Floats, _: Ints) -> Measured:

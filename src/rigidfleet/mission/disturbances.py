@@ -22,7 +22,7 @@ _MOST_NUMBERS = 2.5e8
 _KNOTS, _STEP = 16, 0.1
 
 
-def gust_step(gusts: Gusts, wind: float) -> float:
+def knot_spacing(gusts: Gusts, wind: float) -> float:
     """Time between the knots of gusts [s], in a steady wind of a given speed [m/s]."""
     shortest = gusts.time_scale
     if shortest is None:
@@ -107,7 +107,7 @@ def disturbance_storage_rules(m: Draft) -> Breaches:
         return
     longest = _MOST_NUMBERS / (6 * m.n)  # of a table with one sample a second
     problem = f"would need too much memory for {m.n} agents over {m.end:g} s"
-    step = math.inf if d.gusts is None else gust_step(d.gusts, math.hypot(*d.wind))
+    step = math.inf if d.gusts is None else knot_spacing(d.gusts, math.hypot(*d.wind))
     if m.end / step > longest:
         remedy = "increase the scales (time_scale, length) or shorten the flight"
         yield Breach("gusts", problem, remedy, f"{step:.3g} s between samples")

@@ -46,7 +46,7 @@ _MOST_TURNS = 100
 _MOST_NUMBERS = 5e8
 #: The phases as written, with None for each that is not valid; the greatest duration [s] of each, None if unknown.
 Written = Sequence[Any]
-Lengths = list[float | None]
+Durations = list[float | None]
 
 
 def phase_rules(m: Draft) -> Breaches:
@@ -61,17 +61,17 @@ def phase_rules(m: Draft) -> Breaches:
 
 def _check_phases(m: Draft, phases: Written) -> None:
     """Check phases together, then each with what it needs."""
-    lengths: Lengths = [None] * len(phases)
+    durations: Durations = [None] * len(phases)
     m.record_breaches(("phases",), _phase_name_rules(phases))
-    m.record_breaches((), _phase_ending_rules(m, phases, lengths))
+    m.record_breaches((), _phase_ending_rules(m, phases, durations))
     for k, p in enumerate(phases):
         if p is not None:
             path = ("phases", k)
-            m.record_breaches(path, _motion_time_rules(m, p, k, lengths[k]))
+            m.record_breaches(path, _motion_time_rules(m, p, k, durations[k]))
             if m.is_valid(path, "control"):
                 m.record_breaches(path, _control_rules(m, p))
                 if own := _OWN.get(p.kind):
-                    m.record_breaches(path, own(m, p, k, lengths[k]))
+                    m.record_breaches(path, own(m, p, k, durations[k]))
     m.record_breaches((), _formation_use_rules(m, phases))
     for k, p in enumerate(phases):
         if p is not None:
@@ -122,8 +122,8 @@ def _phase_name_rules(phases: Written) -> Breaches:
             yield Breach((k, "name"), problem, "give each phase its own name", p.name)
 
 
-def _phase_ending_rules(m: Draft, phases: Written, lengths: Lengths) -> Breaches:
-    """Each phase has one ending, and ends increase; notes the greatest ``lengths`` of phases."""
+def _phase_ending_rules(m: Draft, phases: Written, durations: Durations) -> Breaches:
+    """Each phase has one ending, and ends increase; notes the greatest ``durations`` of phases."""
     first: float | None = 0.0  # earliest and latest start of the phase; None if unknown
     last: float | None = 0.0
     for k, p in enumerate(phases):
@@ -162,28 +162,28 @@ def _phase_ending_rules(m: Draft, phases: Written, lengths: Lengths) -> Breaches
             shortest = p.settle.dwell if p.settle is not None else longest
             first = first + (shortest or 0.0) if first is not None else None
             last = last + (longest or 0.0) if last is not None else None
-        lengths[k] = longest
+        durations[k] = longest
     yield from _sample_count_rules(m, last)
 
 
-def _motion_time_rules(m: Draft, p: Phase, k: int, longest: float | None) -> Breaches:
+def _motion_time_rules(m: Draft, p: Phase, k: int, duration: float | None) -> Breaches:
     """The travel or blend of a phase is not longer than the phase."""
     lasts = p.least_time
     if not m.is_valid(("phases", k), "reference", *_ENDINGS):
         return
     if p.shaping is not None and p.shaping.reference == "step":
         yield from unused_key_rules(p, "blend", "reference", "shape")
-    elif longest is None or p.follows_curves or not lasts > longest * (1 + 1e-9):
+    elif duration is None or p.follows_curves or not lasts > duration * (1 + 1e-9):
         return
     elif hasattr(p, "blend"):
-        problem = f"is longer than the phase, which lasts {longest:g} s"
-        yield Breach("blend", problem, f"use blend <= {longest:g} or end the phase later", lasts)
+        problem = f"is longer than the phase, which lasts {duration:g} s"
+        yield Breach("blend", problem, f"use blend <= {duration:g} or end the phase later", lasts)
     else:
-        problem = f"is longer than the phase, which ends after {longest:g} s"
+        problem = f"is longer than the phase, which ends after {duration:g} s"
         yield Breach("travel", problem, "reduce travel or end the phase later", lasts)
 
 
-def _count_numbers_of_sample(m: Draft, n: int) -> int:
+def _estimate_sample_numbers(m: Draft, n: int) -> int:
     """About how many numbers a sample of n agents has in a result."""
     about = {"complete": n**2 // 2, "neighbours": 9 * n}
     edges = sum(
@@ -200,7 +200,7 @@ def _sample_count_rules(m: Draft, end: float | None) -> Breaches:
         return
     switches = 2 * len(m.tables("phases"))  # one sample per step, and two at each change of phase
     samples = end / step + switches
-    numbers = _count_numbers_of_sample(m, n)
+    numbers = _estimate_sample_numbers(m, n)
     if step > end:
         problem, remedy = f"is longer than the mission, which ends at {end:g} s", "reduce it"
     elif end / step > _MOST_SAMPLES:
@@ -262,20 +262,20 @@ def _establish_rules(m: Draft, p: Establish, k: int, _: float | None) -> Breache
         yield Breach([*angles, "attitude"][0], problem, remedy)
 
 
-def _orbit_rules(m: Draft, p: Orbit, k: int, longest: float | None) -> Breaches:
+def _orbit_rules(m: Draft, p: Orbit, k: int, duration: float | None) -> Breaches:
     """An orbit has tracked slots, a rate within bounds, and an end."""
-    yield from _tracked_way_rules(m, p, k, longest)
+    yield from _tracked_way_rules(m, p, k, duration)
     if not m.is_valid(("phases", k), "radius"):
         return
     rate = abs(np.deg2rad(p.rate_deg_s))
-    turns = rate * (longest or 0.0) / (2 * np.pi)
+    turns = rate * (duration or 0.0) / (2 * np.pi)
     if rate == 0.0:
         yield Breach("rate_deg_s", "must not be 0", "give a rate, or use kind = 'fly' or 'hold'")
     elif p.radius * rate > bounds.SPEED.most or p.radius * rate**2 > bounds.ACCELERATION.most:
         problem = f"requires {p.radius * rate:.2g} m/s and {p.radius * rate**2:.2g} m/s^2, beyond the bounds"
         yield Breach("rate_deg_s", problem, "use a lower rate or a smaller radius")
     elif turns > _MOST_TURNS:
-        problem = f"gives {turns:.4g} turns in {longest:g} s; the maximum is {_MOST_TURNS}"
+        problem = f"gives {turns:.4g} turns in {duration:g} s; the maximum is {_MOST_TURNS}"
         yield Breach("rate_deg_s", problem, "use a lower rate or several phases")
 
 
@@ -289,9 +289,9 @@ def _tracked_way_rules(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
         yield Breach("settle", problem, "end it by duration or until", None)
 
 
-def _vertical_rules(m: Draft, p: Any, k: int, longest: float | None) -> Breaches:
+def _vertical_rules(m: Draft, p: Any, k: int, duration: float | None) -> Breaches:
     """A take-off or a landing has what its groups need, and agents that exist."""
-    yield from _tracked_way_rules(m, p, k, longest)
+    yield from _tracked_way_rules(m, p, k, duration)
     if p.lands and p.places == "own" and (p.agents or p.stagger or p.travel or p.until):
         problem = "leads all vehicles together, without agents, stagger, travel and until"
         yield Breach("places", problem, "remove these, and end the phase by its duration")
@@ -308,9 +308,9 @@ def _vertical_rules(m: Draft, p: Any, k: int, longest: float | None) -> Breaches
     yield from named_agent_rules(m, p.agents, "agents")
 
 
-def _go_rules(m: Draft, p: Go, k: int, longest: float | None) -> Breaches:
+def _go_rules(m: Draft, p: Go, k: int, duration: float | None) -> Breaches:
     """A way can be found and flown: tracked slots, an end, and formations that exist."""
-    yield from _tracked_way_rules(m, p, k, longest)
+    yield from _tracked_way_rules(m, p, k, duration)
     for name in p.formations or ():
         yield from _formation_existence_rules(m, name, "formations")
 
@@ -319,9 +319,9 @@ def _go_rules(m: Draft, p: Go, k: int, longest: float | None) -> Breaches:
 _JUMPS = ((0.01, "m"), (0.1, "m/s"))
 
 
-def _follow_rules(m: Draft, p: Follow, k: int, longest: float | None) -> Breaches:
+def _follow_rules(m: Draft, p: Follow, k: int, duration: float | None) -> Breaches:
     """There are trajectories, without jumps, one for the virtual body or one for each vehicle, and an end."""
-    yield from _tracked_way_rules(m, p, k, longest)
+    yield from _tracked_way_rules(m, p, k, duration)
     if p.trajectories is None:
         problem, remedy = "is missing", "give the name of a file with trajectories"
         if p.file is not None:
@@ -365,7 +365,7 @@ def _follow_rules(m: Draft, p: Follow, k: int, longest: float | None) -> Breache
                 remedy = f"correct it: at most {most:g} {unit} is taken for rounding"
                 yield Breach(("trajectories", i), problem, remedy, None)
                 return
-    if p.travel and p.settle is None and longest is not None and longest > p.travel * (1 + 1e-9):
+    if p.travel and p.settle is None and duration is not None and duration > p.travel * (1 + 1e-9):
         # Beyond the file the body goes on as it ends, and the vehicles rest beside each other.
         v = way.states(way.time[-1:], 2)[1, 0, :, :3] * (way.time[-1] / p.travel)
         mass = () if m.agents is None else m.agents.mass

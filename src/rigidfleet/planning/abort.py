@@ -310,7 +310,7 @@ class Aborts:
         s = clock.states(time, 4)
         ends = tuple(x[:, turn] for x in plan.with_knots(s[0, turn]).piece_end_states(4))[turn]
         rates = s[1:, :-1], s[1:, 1:]
-        return Piecewise.of_ends(time, *map(_states_by_clock, ends, rates))
+        return Piecewise.of_end_states(time, *map(_states_by_clock, ends, rates))
 
     def step_by_clock(self, name: str, clock: Piecewise) -> Step:
         """A step along the plan by a clock, either way: its least separation is that which the legs it meets prove."""

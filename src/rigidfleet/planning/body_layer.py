@@ -96,7 +96,7 @@ class Detour:
         return series.series_by_derivatives(self.x), Q, series.series_by_derivatives(self.scale)
 
 
-def least_norm_solution(G: Floats, h: Floats) -> Floats | None:
+def least_norm_feasible(G: Floats, h: Floats) -> Floats | None:
     """The shortest y (n,) with G y >= h, for G (m, n), or None if there is none; Lawson and Hanson, algorithm LDP."""
     from scipy.optimize import nnls  # takes long to load
 
@@ -141,7 +141,7 @@ def nearest_accelerations(
     L = np.linalg.cholesky(H)
     G = np.linalg.solve(L, rows.T).T
     size = np.linalg.norm(G, axis=1)
-    y = least_norm_solution(G / size[:, None], (needed - rows @ accelerations) / size)
+    y = least_norm_feasible(G / size[:, None], (needed - rows @ accelerations) / size)
     return None if y is None else accelerations + np.linalg.solve(L.T, y)
 
 

@@ -106,7 +106,7 @@ def smooth_motion(
     meets = points, begin, end, *(np.array(at.velocity or zero * np.nan) for at in through)
     times = np.array([0.0, *(at.time or np.nan for at in through), total])
     if np.isnan(times).any():
-        times = splines.least_snap_times(total, *meets)
+        times = splines.least_snap_knots(total, *meets)
     phi = np.stack([pose_turn_from(start, goal.T), np.stack([zero, goal.omega, zero, zero])], 1)
     turn = Piecewise.hermite(times[[0, -1]], phi).with_knots(times).pieces
     cm = splines.minimum_snap(times, *meets)

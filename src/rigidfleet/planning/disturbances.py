@@ -13,7 +13,7 @@ import numpy as np
 from rigidfleet.kernel.problem import Disturbance, Problem, graph, no_disturbance
 from rigidfleet.math import turbulence
 from rigidfleet.mission import Gusts, Mission
-from rigidfleet.mission.disturbances import gust_intensity, gust_step
+from rigidfleet.mission.disturbances import gust_intensity, knot_spacing
 from rigidfleet.planning import filters
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -39,7 +39,7 @@ def mission_disturbance(mission: Mission) -> Disturbance:
         roofs=mission.roofs,
     )
     if d.gusts is not None:
-        step = gust_step(d.gusts, float(np.linalg.norm(wind)))
+        step = knot_spacing(d.gusts, float(np.linalg.norm(wind)))
         out = out._replace(
             gust_step=step, gust=filters.spline_coefficients(_gusts(mission, d.gusts, wind, step))
         )

@@ -64,10 +64,10 @@ def limits_of(
     limits, n = limits or mission.limits, mission.n_agents
     mass, up = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
 
-    def lag_overshoot(derivative: int, motion: Floats, who: Ints) -> Floats | float:
-        if reserve is None or derivative + 1 >= motion.shape[1]:
+    def lag_overshoot(derivative: int, states: Floats, who: Ints) -> Floats | float:
+        if reserve is None or derivative + 1 >= states.shape[1]:
             return 0.0  # the jerk that counts is that of the slots
-        return reserve[who] * np.linalg.norm(motion[:, derivative + 1], axis=-1).max(axis=0)
+        return reserve[who] * np.linalg.norm(states[:, derivative + 1], axis=-1).max(axis=0)
 
     def motion_with_overshoot(q: Quantity, x: Floats, who: Ints) -> Floats:
         return SIZES[q.way](x[:, q.order]) + lag_overshoot(q.order, x, who)

@@ -32,7 +32,7 @@ from rigidfleet.planning.derivatives import (
     yaw_derivatives,
 )
 from rigidfleet.planning.disturbances import mission_disturbance
-from rigidfleet.planning.virtual_clock import delay_by
+from rigidfleet.planning.virtual_clock import postpone
 from rigidfleet.typing import Floats, Ints
 
 #: Rows of random numbers in a block.
@@ -303,7 +303,7 @@ class TickTables:
     def delay_path(self, late: float) -> None:
         """Take the path that states were last measured about as later by some time [s]."""
         if self._source is not None:
-            self._source = delay_by(self._source, late)
+            self._source = postpone(self._source, late)
 
     def _path_by_clocks(self, tick: int, tau: Floats | None) -> Floats:
         """The path (N, 6) at a tick, of each vehicle by its own clock, if it has one."""
@@ -338,11 +338,11 @@ class TickTables:
         slots, path = np.zeros(0), np.zeros((0, self.n, 6))
         if not self.flight.vehicles.point.all() or self.yaw.kind == "along":
             # An ideal point has no attitude that goes ahead of its force.
-            yaw, slots = self._yaw_slots(problem, ticks / self.rate, turn)
+            yaw, slots = self._yaw_and_slots(problem, ticks / self.rate, turn)
             if len(slots):
                 jerk, snap = self._desired_jerk_and_snap(slots)
         if self.compensated:
-            path = _tick_rows(slots[:2].reshape(6, self.n, -1)) if len(slots) else self._path(ticks)
+            path = _by_tick(slots[:2].reshape(6, self.n, -1)) if len(slots) else self._path(ticks)
         noise_r = noise_v = np.zeros((0, self.n, 3))
         dropped = np.zeros((0, self.n), dtype=np.bool_)
         if self.noise is not None:
@@ -370,28 +370,28 @@ class TickTables:
         """Yaw and its rate (2, N) [rad, rad/s] asked of each vehicle at a time [s] of a phase."""
         if t <= turn.begun:
             return turn.start
-        return self._yaw_slots(problem, np.array([t]), turn)[0][0, :, :2].T
+        return self._yaw_and_slots(problem, np.array([t]), turn)[0][0, :, :2].T
 
-    def _yaw_slots(self, problem: Problem, time: Floats, turn: YawTurn) -> tuple[Floats, Floats]:
+    def _yaw_and_slots(self, problem: Problem, t: Floats, turn: YawTurn) -> tuple[Floats, Floats]:
         """Yaw with two derivatives (K, N, 3) of each vehicle at times (K,) [s], and derivatives (5, 3, N, K) of slots.
 
         A vehicle turns with the formation, or from its yaw at the start of the phase into the one asked for.
         """
         if problem.control.kind != TRACKING:
-            still = np.zeros((len(time), self.n, 3))
+            still = np.zeros((len(t), self.n, 3))
             still[..., 0] = turn.start[0]
-            return still, np.zeros((0, 3, self.n, len(time)))
+            return still, np.zeros((0, 3, self.n, len(t)))
         reference, motion = problem.reference, problem.motion
         since, start = turn.begun, turn.start
-        if self._known is not None and self._known[0] is turn and self._known[1] < time[0]:
+        if self._known is not None and self._known[0] is turn and self._known[1] < t[0]:
             since, start = self._known[1], self._known[2][None]
-        whole = np.concatenate([[since], time])
+        whole = np.concatenate([[since], t])
         slots, turned, known = slot_taylor_and_yaw(
             reference, motion, whole, self.yaw, turn._replace(start=start)
         )
         if known is not None:
             self._known = turn, *known
-        return _tick_rows(turned[..., 1:]), series.taylor_derivatives(slots[..., 1:])
+        return _by_tick(turned[..., 1:]), series.taylor_derivatives(slots[..., 1:])
 
     def _desired_jerk_and_snap(self, derivatives: Floats) -> tuple[Floats, Floats]:
         """Two derivatives (K, N, 3) of the desired force per mass, from those of the reference, (5, 3, N, K).
@@ -409,7 +409,7 @@ class TickTables:
             curve = ((a * a + v * j).sum(axis=0) - faster**2) / speed
             jerk += c * (speed * a + faster * v)
             snap += c * (speed * j + 2.0 * faster * a + curve * v)
-        return _tick_rows(jerk), _tick_rows(snap)
+        return _by_tick(jerk), _by_tick(snap)
 
 
 def commanded_yaw(mission: Mission) -> Yaw:
@@ -479,7 +479,7 @@ def slot_taylor_and_yaw(
     return slots, turned, None
 
 
-def _tick_rows(x: Floats) -> Floats:
+def _by_tick(x: Floats) -> Floats:
     """A table (K, N, Q) of values (Q, N, K)."""
     return np.ascontiguousarray(x.T)
 

@@ -98,7 +98,7 @@ class VirtualClock:
         return high
 
 
-def delay_by(problem: Problem, delay: float) -> Problem:
+def postpone(problem: Problem, delay: float) -> Problem:
     """A problem whose references come later by a delay [s]."""
     reference, motion = problem.reference, problem.motion
     return problem._replace(

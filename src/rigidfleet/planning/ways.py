@@ -308,7 +308,7 @@ class _Search:
         """What stands in the way, and how much is missing."""
         mistake = partial(self.mistake, "position", self.phase.position)
         for what, place, layer in (("start", self.begin, 0), ("goal", self.end, self._last)):
-            room, agent, thing = self._least_gap(roadmap, place, layer)
+            room, agent, thing = self._tight_agent(roadmap, place, layer)
             if room < roadmap.need:
                 problem = (
                     f"its {what} leaves agent {agent + 1} {room:.2f} m of clearance from {thing}, which is less"
@@ -316,7 +316,7 @@ class _Search:
                 )
                 return mistake(problem, "move it, or ask for less clearance")
         least, place, layer = roadmap.widest_way_bottleneck((self.begin, 0), (self.end, self._last))
-        x, (_, _, thing) = roadmap.layers[layer], self._least_gap(roadmap, place, layer)
+        x, (_, _, thing) = roadmap.layers[layer], self._tight_agent(roadmap, place, layer)
         where = ", ".join(f"{v:z.2f}" for v in place)
         problem = (
             f"no way is found: at the narrowest place of the best one, ({where}) m, '{x.formation}' at yaw"
@@ -328,7 +328,7 @@ class _Search:
         remedy = "allow a slimmer formation (formations, scales), ask for less clearance, or name points on the way"
         return mistake(problem, remedy)
 
-    def _least_gap(self, roadmap: Roadmap, place: Floats, layer: int) -> tuple[float, int, str]:
+    def _tight_agent(self, roadmap: Roadmap, place: Floats, layer: int) -> tuple[float, int, str]:
         """The least room [m] of an agent at a place, the agent, and what is nearest to it."""
         r, space = place + roadmap.layers[layer].offsets, roadmap.space
         room = space.clearance(r, roadmap.radius)

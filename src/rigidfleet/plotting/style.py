@@ -443,11 +443,11 @@ def number_phases(axes: Iterable[Axes], result: Result) -> str:
             else:
                 right = box.x1
     # A line of the key breaks between names alone
-    names = (f"{i + 1} {clean_name(name)}  ·" for i, name in enumerate(_phase_names(result)))
+    names = (f"{i + 1} {clean_name(name)}  ·" for i, name in enumerate(_short_phase_names(result)))
     return "Phases:  " + "  ".join(x.replace(" ", "\N{NO-BREAK SPACE}") for x in names)[:-3]
 
 
-def _phase_names(result: Result) -> list[str]:
+def _short_phase_names(result: Result) -> list[str]:
     """Names of the phases; a name by default, kind and number, without its number."""
     return [p.kind if p.name == f"{p.kind} {i}" else p.name for i, p in enumerate(result.phases, 1)]
 
@@ -457,6 +457,6 @@ def _phase_spans(ax: Axes, result: Result) -> list[tuple[str, float, float]]:
     low, high = ax.get_xlim()
     return [
         (name, max(p.t_start, low), min(p.t_end, high))
-        for name, p in zip(_phase_names(result), result.phases, strict=True)
+        for name, p in zip(_short_phase_names(result), result.phases, strict=True)
         if p.t_start < high
     ]

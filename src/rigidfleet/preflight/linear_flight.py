@@ -147,7 +147,7 @@ class LinearFlight:
         rows = grip[:, :, None] * self._coupling[who] + self._diagonal[who]
         return np.linalg.inv(rows) * grip[:, None]
 
-    def _slipping_vehicle_inverses(self, grip: Floats) -> tuple[Ints, Ints, Floats]:
+    def _slips_and_inverses(self, grip: Floats) -> tuple[Ints, Ints, Floats]:
         """Vehicles (K,) in flights (K,) of which an edge slips, and the inverses of their equations."""
         each = np.concatenate([grip, np.ones((1, grip.shape[1]))])[self._rows]
         who, flight = np.nonzero((each < 1.0).any(axis=1))
@@ -200,7 +200,7 @@ class LinearFlight:
             integral += tick * (gap if grip is None else gap * (grip > 0.0))
             right = held[_INPUT] - own @ put - 2.0 * law.alpha * along - law.beta**2 * gap
             right -= law.gamma * integral
-            slipping = None if grip is None else self._slipping_vehicle_inverses(grip)
+            slipping = None if grip is None else self._slips_and_inverses(grip)
             y, force, rest = np.zeros_like(right), 0.0, []
             for theirs in held[_REST:]:
                 y = self._multipliers(self._mean * (right + theirs) + self._damping * y, slipping)

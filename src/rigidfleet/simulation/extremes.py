@@ -262,11 +262,11 @@ class CurveWatch:
                 return Extremum(float(near[i]), float(self.low[i, 1]), i, int(self.low[i, 2]))
         return None
 
-    def _extremum(self, k: int) -> Extremum | None:
-        value = float(self.worst[k])
+    def _extremum(self, kind: int) -> Extremum | None:
+        value = float(self.worst[kind])
         if not math.isfinite(value):
             return None
-        return Extremum(value, float(self.when[k]), *map(int, self.who[k]))
+        return Extremum(value, float(self.when[kind]), *map(int, self.who[kind]))
 
     # -- large fleets ---------------------------------------------------------------------------------
 

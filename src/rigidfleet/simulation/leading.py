@@ -29,7 +29,7 @@ from rigidfleet.planning.body_layer import (
 )
 from rigidfleet.planning.derivatives import body_taylor, slot_derivatives, slot_taylor
 from rigidfleet.planning.plan import PhasePlan
-from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock, delay_by, time_derivatives
+from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock, postpone, time_derivatives
 from rigidfleet.result import Extremum
 from rigidfleet.solids.distance import local_point, outward_normal, signed_distance
 from rigidfleet.typing import Floats, Ints
@@ -134,7 +134,7 @@ class Leader:
             if not self.leads:
                 return None
             self.leads = False
-            return delay_by(self.problem, self.clock.delay)
+            return postpone(self.problem, self.clock.delay)
         self.leads = True
         self.now = LeaderState(t, copy.copy(self.clock), self.deviation)
         problem = self._detour_problem(t, h, accelerations)
@@ -283,7 +283,7 @@ class Leader:
         phi = series.taylor_derivatives(series.rotation_vector_taylor(B[0, 0].T @ B))
         channels = np.concatenate([x.transpose(0, 2, 1), phi], axis=2)  # (3, ends, 6)
         polynomials = Motion(times, _quintics(times, channels), np.ascontiguousarray(B[0, 0].T))
-        late, scaled = delay_by(problem, self.clock.delay).reference, self._is_any_scaled(ends)
+        late, scaled = postpone(problem, self.clock.delay).reference, self._is_any_scaled(ends)
         if not (p[1:].any() or scaled):
             return problem._replace(motion=polynomials, reference=late)
         ways = _quintics(times, p.transpose(0, 3, 2, 1))

@@ -31,7 +31,7 @@ from rigidfleet.planning.vehicles import (
     sampled_flight,
     yaw_turn_from,
 )
-from rigidfleet.planning.virtual_clock import delay_by
+from rigidfleet.planning.virtual_clock import postpone
 from rigidfleet.result import Extremum
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import (
@@ -420,7 +420,7 @@ class SampledPhase(ActivePhase):
                 np.add(off, late, out=off)  # also in messages
             self.vehicles.waited += late
             self.vehicles.tables.delay_path(late)
-            plan.problem = delay_by(plan.problem, late)
+            plan.problem = postpone(plan.problem, late)
             plan.reference = plan.reference._replace(t0=plan.reference.t0 + late)
         self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
         if self.leader is not None:

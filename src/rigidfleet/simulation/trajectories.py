@@ -149,7 +149,7 @@ def trajectories(
         raise ResultError(f"all samples are at {t[0]:g} s; a trajectory lasts.")
     yaws = np.full(shape[:2], np.nan) if yaw is None else _check_numbers("yaw", yaw, *shape[:2])
     x, angle = np.stack(states), np.unwrap(yaws, axis=0)[None, ..., None]
-    way, turned = (Piecewise.of_ends(knots, y[:, first], y[:, first + 1]) for y in (x, angle))
+    way, turned = (Piecewise.of_end_states(knots, y[:, first], y[:, first + 1]) for y in (x, angle))
     how = NAMES[2 * len(states) - 1]
     if cubic and len(states) == 1:
         _refuse_jumps(way)

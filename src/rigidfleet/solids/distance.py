@@ -155,54 +155,54 @@ def vector_from_triangle(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
 # -- surfaces of triangles -----------------------------------------------------------------------------
 
 
-def vector_from_solid_surface(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+def vector_from_solid_surface(x: Numbers, y: Numbers, z: Numbers, b: int, solids: Any) -> Any:
     """Vector from the nearest point of the surface of solid b, of triangles, to the point, and its squared length."""
-    first, last = s.first[b], s.last[b]
-    t = s.triangles[first[1]]
+    first, last = solids.first[b], solids.last[b]
+    t = solids.triangles[first[1]]
     i, j, k = x - t[0, 0], y - t[0, 1], z - t[0, 2]
-    if s.kind[b] == HEIGHTS:  # straight below
-        u, v, h = height_map_point(x, y, b, s)
+    if solids.kind[b] == HEIGHTS:  # straight below
+        u, v, h = height_map_point(x, y, b, solids)
         i, j, k = x - u, y - v, z - h
     best = i * i + j * j + k * k
     node = first[0]
     while node < last[0]:
-        far = np.maximum(box_distance(x, y, z, s.nodes[node]), 0.0)
+        far = np.maximum(box_distance(x, y, z, solids.nodes[node]), 0.0)
         if not any_true(far * far < best):
-            node = s.after[node]
+            node = solids.after[node]
             continue
-        for m in range(s.leaf[node, 0], s.leaf[node, 1]):
-            u, v, w, d = vector_from_triangle(x, y, z, s.triangles[m])
+        for m in range(solids.leaf[node, 0], solids.leaf[node, 1]):
+            u, v, w, d = vector_from_triangle(x, y, z, solids.triangles[m])
             nearer = d < best
             i, j, k, best = choose(nearer, (u, v, w, d), (i, j, k, best))
         node += 1
     return i, j, k, best
 
 
-def height_map_point(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
+def height_map_point(x: Numbers, y: Numbers, b: int, solids: Any) -> Any:
     """The point (x, y, height) of a height map straight below or above the point, or its nearest rim."""
-    size, first = s.size[b], s.first[b, 2]
-    n, m = s.grid[b, 0], s.grid[b, 1]
+    size, first = solids.size[b], solids.first[b, 2]
+    n, m = solids.grid[b, 0], solids.grid[b, 1]
     u = np.minimum(np.maximum(x, 0.0), size[3])
     v = np.minimum(np.maximum(y, 0.0), size[4])
     p, q = u / size[3] * (n - 1), v / size[4] * (m - 1)
     i, j = floor(np.minimum(p, n - 1.5)), floor(np.minimum(q, m - 1.5))
     p, q, at = p - i, q - j, first + i * m + j
-    low, high = s.heights[at], s.heights[at + m + 1]
-    lower = low + p * (s.heights[at + m] - low) + q * (high - s.heights[at + m])
-    upper = low + q * (s.heights[at + 1] - low) + p * (high - s.heights[at + 1])
+    low, high = solids.heights[at], solids.heights[at + m + 1]
+    lower = low + p * (solids.heights[at + m] - low) + q * (high - solids.heights[at + m])
+    upper = low + q * (solids.heights[at + 1] - low) + p * (high - solids.heights[at + 1])
     return u, v, where(p >= q, lower, upper)
 
 
-def is_inside(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+def is_inside(x: Numbers, y: Numbers, z: Numbers, b: int, solids: Any) -> Any:
     """Whether the point is inside a solid of triangles: a convex hull or a height map."""
-    inside = box_distance(x, y, z, s.size[b]) <= 0.0
+    inside = box_distance(x, y, z, solids.size[b]) <= 0.0
     if not any_true(inside):
         return inside
-    if s.kind[b] == HEIGHTS:
-        _, _, height = height_map_point(x, y, b, s)
+    if solids.kind[b] == HEIGHTS:
+        _, _, height = height_map_point(x, y, b, solids)
         return inside & (z <= height)
-    for m in range(s.first[b, 1], s.last[b, 1]):
-        t = s.triangles[m]
+    for m in range(solids.first[b, 1], solids.last[b, 1]):
+        t = solids.triangles[m]
         n = facet_cross_product(t)
         out = (x - t[0, 0]) * n[0] + (y - t[0, 1]) * n[1] + (z - t[0, 2]) * n[2]
         inside = inside & (out <= 0.0)
@@ -212,60 +212,60 @@ def is_inside(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
 # -- any solid -----------------------------------------------------------------------------------------
 
 
-def signed_distance(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Numbers:
-    """Signed distance [m] from solid b of a record s; negative inside."""
-    kind = s.kind[b]
+def signed_distance(x: Numbers, y: Numbers, z: Numbers, b: int, solids: Any) -> Numbers:
+    """Signed distance [m] from solid b of some; negative inside."""
+    kind = solids.kind[b]
     if kind == ROUNDED:
-        near = box_distance(x, y, z, s.size[b])
-        if s.rounding[b] > 0.0:
-            near = near - s.rounding[b]
+        near = box_distance(x, y, z, solids.size[b])
+        if solids.rounding[b] > 0.0:
+            near = near - solids.rounding[b]
         return near
     if kind == CYLINDER:
-        return cylinder_distance(x, y, z, s.size[b])
-    _, _, _, squared = vector_from_solid_surface(x, y, z, b, s)
+        return cylinder_distance(x, y, z, solids.size[b])
+    _, _, _, squared = vector_from_solid_surface(x, y, z, b, solids)
     away = np.sqrt(squared)
-    return where(is_inside(x, y, z, b, s), -away, away)
+    return where(is_inside(x, y, z, b, solids), -away, away)
 
 
-def outward_normal(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+def outward_normal(x: Numbers, y: Numbers, z: Numbers, b: int, solids: Any) -> Any:
     """Unit gradient of the signed distance; three zeros on the surface of a hull or height map, where it is unknown."""
-    kind = s.kind[b]
+    kind = solids.kind[b]
     if kind == ROUNDED:
-        return box_normal(x, y, z, s.size[b])
+        return box_normal(x, y, z, solids.size[b])
     if kind == CYLINDER:
-        return cylinder_normal(x, y, z, s.size[b])
-    i, j, k, squared = vector_from_solid_surface(x, y, z, b, s)
+        return cylinder_normal(x, y, z, solids.size[b])
+    i, j, k, squared = vector_from_solid_surface(x, y, z, b, solids)
     away = np.sqrt(squared)
-    away = where(is_inside(x, y, z, b, s), -away, away)
+    away = where(is_inside(x, y, z, b, solids), -away, away)
     known = squared > 0.0
     i, j, k, away = choose(known, (i, j, k, away), (0.0, 0.0, 0.0, 1.0))
     return i / away, j / away, k / away
 
 
-def solid_displacement(t: Numbers, b: int, s: Any) -> Any:
+def solid_displacement(t: Numbers, b: int, solids: Any) -> Any:
     """Displacement [m] of solid b at time t [s]: straight between waypoints, at rest before and after them."""
-    first, last = s.first[b, 3], s.last[b, 3]
+    first, last, times = solids.first[b, 3], solids.last[b, 3], solids.times
     x = y = z = 0.0 * t
     if last > first:
-        x, y, z = x + s.ways[first, 0], y + s.ways[first, 1], z + s.ways[first, 2]
+        x, y, z = x + solids.ways[first, 0], y + solids.ways[first, 1], z + solids.ways[first, 2]
     for k in range(first, last - 1):
-        share = np.minimum(np.maximum((t - s.times[k]) / (s.times[k + 1] - s.times[k]), 0.0), 1.0)
-        x = x + share * (s.ways[k + 1, 0] - s.ways[k, 0])
-        y = y + share * (s.ways[k + 1, 1] - s.ways[k, 1])
-        z = z + share * (s.ways[k + 1, 2] - s.ways[k, 2])
+        share = np.minimum(np.maximum((t - times[k]) / (times[k + 1] - times[k]), 0.0), 1.0)
+        x = x + share * (solids.ways[k + 1, 0] - solids.ways[k, 0])
+        y = y + share * (solids.ways[k + 1, 1] - solids.ways[k, 1])
+        z = z + share * (solids.ways[k + 1, 2] - solids.ways[k, 2])
     return x, y, z
 
 
-def is_solid_present(t: Numbers, b: int, s: Any) -> Any:
+def is_solid_present(t: Numbers, b: int, solids: Any) -> Any:
     """Whether solid b is there at time t [s]: some appear, and vanish."""
-    return (t >= s.there[b, 0]) & (t <= s.there[b, 1])
+    return (t >= solids.there[b, 0]) & (t <= solids.there[b, 1])
 
 
-def local_point(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+def local_point(x: Numbers, y: Numbers, z: Numbers, b: int, solids: Any) -> Any:
     """Coordinates in the axes of solid b, without its motion, of a point in the world."""
-    if s.turned[b] == 0:
+    if solids.turned[b] == 0:
         return x, y, z
-    o, T = s.origin[b], s.turn[b]
+    o, T = solids.origin[b], solids.turn[b]
     x, y, z = x - o[0], y - o[1], z - o[2]
     return (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
@@ -279,15 +279,15 @@ def local_point(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
 _LOWERED, STEEP = 1e-3, 0.5
 
 
-def is_solid_below(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+def is_solid_below(x: Numbers, y: Numbers, z: Numbers, b: int, solids: Any) -> Any:
     """Whether the nearest part of solid b is below a point of the world, so that a vehicle may stand on it.
 
     Nobody stands on what moves.
     """
-    u, v, w = local_point(x, y, z, b, s)
-    i, j, k = local_point(x, y, z - _LOWERED, b, s)
-    still = s.last[b, 3] == s.first[b, 3]
-    nearer = signed_distance(u, v, w, b, s) - signed_distance(i, j, k, b, s)
+    u, v, w = local_point(x, y, z, b, solids)
+    i, j, k = local_point(x, y, z - _LOWERED, b, solids)
+    still = solids.last[b, 3] == solids.first[b, 3]
+    nearer = signed_distance(u, v, w, b, solids) - signed_distance(i, j, k, b, solids)
     return (nearer >= STEEP * _LOWERED) & still
 
 
@@ -298,16 +298,16 @@ _DEEP = 1.0
 _TINY, _FAR = 1e-200, 1e30
 
 
-def height_range(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
+def height_range(x: Numbers, y: Numbers, b: int, solids: Any) -> Any:
     """Lowest and highest z [m] of solid b, a box or a height map at rest, over points (x, y) of the world.
 
     Where there is nothing of it, the first is above the second.
     """
-    o, T, size = s.origin[b], s.turn[b], s.size[b]
+    o, T, size = solids.origin[b], solids.turn[b], solids.size[b]
     x, y = where(np.isfinite(x), x, _FAR) - o[0], where(np.isfinite(y), y, _FAR) - o[1]
-    if s.turned[b] == 0 or s.kind[b] == HEIGHTS:
+    if solids.turned[b] == 0 or solids.kind[b] == HEIGHTS:
         over = (x >= size[0]) & (x <= size[3]) & (y >= size[1]) & (y <= size[4])
-        top = height_map_point(x, y, b, s)[2] if s.kind[b] == HEIGHTS else size[5]
+        top = height_map_point(x, y, b, solids)[2] if solids.kind[b] == HEIGHTS else size[5]
         return where(over, size[2], math.inf), where(over, top, -math.inf)
     low, top = x * 0.0 - math.inf, x * 0.0 + math.inf
     for k in range(3):
@@ -317,12 +317,12 @@ def height_range(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
     return low, top
 
 
-def height_below(x: Numbers, y: Numbers, z: Numbers, s: Any) -> Numbers:
+def height_below(x: Numbers, y: Numbers, z: Numbers, solids: Any) -> Numbers:
     """Height [m] of the highest of all solids, boxes and height maps at rest, below points; minus infinity: none."""
     height = x * 0.0 - math.inf
-    for b in range(s.kind.shape[0]):
-        low, top = height_range(x, y, b, s)
-        on = (low <= top) & (z >= low) & ((z >= top - _DEEP) | (s.kind[b] == HEIGHTS))
+    for b in range(solids.kind.shape[0]):
+        low, top = height_range(x, y, b, solids)
+        on = (low <= top) & (z >= low) & ((z >= top - _DEEP) | (solids.kind[b] == HEIGHTS))
         height = where(on, np.maximum(height, top), height)
     return height
 

@@ -138,7 +138,7 @@ def height_map(corner: ArrayLike, spacing: ArrayLike, heights: ArrayLike, base: 
     top = np.stack([i * x, j * y, z], axis=-1)
     low = top.copy()
     low[..., 2] = base
-    faces = _surface_triangles(top)
+    faces = [_surface_triangles(top)]
     for rim, under in (
         (top[0], low[0]), (top[-1, ::-1], low[-1, ::-1]), (top[::-1, 0], low[::-1, 0]), (top[:, -1], low[:, -1]),
     ):  # fmt: skip
@@ -151,12 +151,12 @@ def height_map(corner: ArrayLike, spacing: ArrayLike, heights: ArrayLike, base: 
     return Form(HEIGHTS, origin, _UPRIGHT, size, triangles=np.concatenate(faces), heights=z)
 
 
-def _surface_triangles(top: Floats) -> list[Floats]:
-    """Triangles of the surface of a height map, whose grid points are (I, J, 3); corners anticlockwise from above."""
+def _surface_triangles(top: Floats) -> Floats:
+    """Triangles (M, 3, 3) of the surface of a height map of grid points (I, J, 3); corners anticlockwise from above."""
     a, b, c, d = (
         x.reshape(-1, 3) for x in (top[:-1, :-1], top[1:, :-1], top[1:, 1:], top[:-1, 1:])
     )
-    return [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
+    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
 # -- many solids in one record -------------------------------------------------------------------------

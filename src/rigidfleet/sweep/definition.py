@@ -568,7 +568,7 @@ class _Check:
                 problem = "with final states alone, only numbers in agents.position and agents.velocity can vary"
                 remedy = f"remove it, or {_WHOLE}"
             else:
-                if absent or keypaths.is_table_absent(self.whole, keys):
+                if absent or keypaths.is_in_absent_table(self.whole, keys):
                     self.lacked.append((k, SweepColumn(v, keys)))
                 continue
             self.add(where, problem, remedy, path)

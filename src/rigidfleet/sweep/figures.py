@@ -218,7 +218,7 @@ def histograms(table: Table) -> Figure | None:
     if not names:
         return None
     fig, axes = _axes_for_metrics(table, "Metrics of all runs", names)
-    limits, shown = _metric_limits(table), False
+    limits, shown = _fixed_metric_limits(table), False
     for name, ax in zip(names, axes, strict=True):
         x = table.metrics[name]
         finite = np.isfinite(x)
@@ -428,7 +428,7 @@ def _axis_label(table: Table, name: str) -> str:
     return f"{name}{how} [{readable_unit(unit)}]"
 
 
-def _metric_limits(table: Table) -> dict[str, float]:
+def _fixed_metric_limits(table: Table) -> dict[str, float]:
     """Limits of the mission for metrics, unless they vary."""
     moved = {key for column in table.sweep.columns for key in column.keys[:2]}
     limits = {q.name: q.limit_of(table.sweep.mission) for q in QUANTITIES.values() if q.checked}

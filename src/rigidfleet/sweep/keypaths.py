@@ -80,7 +80,7 @@ def replace_value(
         at = at[k]
 
 
-def is_table_absent(whole: Mapping[str, Any], keys: Keys) -> bool:
+def is_in_absent_table(whole: Mapping[str, Any], keys: Keys) -> bool:
     """Whether a place is in a table that the mission does not have."""
     return any(isinstance(look_up(whole, keys[:k]), Absent) for k in range(1, len(keys)))
 

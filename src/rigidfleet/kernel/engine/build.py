@@ -108,7 +108,7 @@ def avoidance_object_code() -> list[bytes]:
     problem, workspace = (pointer_cast(_numba_type_of(kind)) for kind in (Problem, Workspace))
 
     def avoid(f, s, a, _):
-        return guard.guard_forces(problem(a.law[0]), workspace(a.law[1]), f, s, a)
+        return guard.correct_forces(problem(a.law[0]), workspace(a.law[1]), f, s, a)
 
     word = types.int64
     kinds = fleet.SampledFlight, fleet.SampledState, AvoidanceArrays, word
@@ -121,11 +121,11 @@ def solids_object_code() -> list[bytes]:
 
     row_of = monitor.trail_row_of
 
-    def watch_trail_clearances(first, end, p, state, watch, s):
+    def watch_trail_clearances(first, end, p, state, watch, solids):
         for step in range(first, end):
             row, trail = row_of(step, state), state.trail
             watch_clearances(
-                trail.points[row], trail.clock[row, 0], trail.clock[row, 1], p, s, watch
+                trail.points[row], trail.clock[row, 0], trail.clock[row, 1], p, solids, watch
             )
 
     kinds = types.int64, types.int64, Problem, IntegratorState, Monitor, Solids

@@ -42,14 +42,14 @@ def fly_ticks(
     return native.library("sampled").fly_ticks(*(x.address for x in arguments))
 
 
-def guard_forces(
+def correct_forces(
     problem: Problem,
     workspace: Workspace,
     flight: SampledFlight,
     state: SampledState,
     avoidance: AvoidanceArrays,
 ) -> int:
-    """Filter and guard ``state.force`` once, at ``state.work.law_time``; see `rigidfleet.kernel.guard.guard_forces`."""
+    """Filter and guard ``state.force`` once, at `work.law_time`; see `rigidfleet.kernel.guard.correct_forces`."""
     kept = _pack_avoidance(avoidance, problem, workspace)
     return native.library("avoidance").avoid(
         pack(flight).address, pack(state).address, kept.address, 0
