@@ -50,7 +50,7 @@ needed_rate = jit_inline(_needed_rate)
 
 
 @jit
-def weaken_edge_forces(p, w, state, a):
+def weaken_edge_forces(p, w, state, avoid):
     """Take from the forces of edges what they let go, and from their integrals what the tick has added to it.
 
     All edges let go by one share, that of the vehicle that is pushed most: where edges are redundant, forces of single
@@ -58,7 +58,7 @@ def weaken_edge_forces(p, w, state, a):
     """
     edges, free = p.graph.edges, 0.0
     for e in range(edges.shape[0]):
-        free = max(free, 1.0 - min(a.hold[edges[e, 0]], a.hold[edges[e, 1]]))
+        free = max(free, 1.0 - min(avoid.hold[edges[e, 0]], avoid.hold[edges[e, 1]]))
     if free > 0.0:
         find_multipliers(p.graph)
     for e in range(edges.shape[0] if free > 0.0 else 0):
@@ -68,38 +68,38 @@ def weaken_edge_forces(p, w, state, a):
             state.force[i, q] -= force
             state.force[j, q] += force
         if not (state.saturated[i] or state.saturated[j]):
-            state.integral[e] -= free * a.period * w.c[e]
+            state.integral[e] -= free * avoid.period * w.c[e]
 
 
 @jit
-def add_barrier(count, i, j, entry, n, missing_accel, limit, a):
+def add_barrier(count, i, j, entry, n, missing_accel, limit, avoid):
     """Add a barrier along n (3,), with its entry of ``last``; returns the number of them.
 
     It changes the acceleration along n by twice ``limit_thrust`` at most.
     """
-    if count < a.rows.shape[0]:
-        a.rows[count, 0], a.rows[count, 1], a.rows[count, 2] = i, j, entry
+    if count < avoid.rows.shape[0]:
+        avoid.rows[count, 0], avoid.rows[count, 1], avoid.rows[count, 2] = i, j, entry
         for q in range(3):
-            a.normals[count, q] = n[q]
-        reduced = 1.0 / (a.inverse[i] + (a.inverse[j] if j >= 0 else 0.0))
-        a.missing[count], a.most[count] = missing_accel, 2.0 * limit * reduced
-        a.push[count], a.reduced[count] = min(a.last[entry], a.most[count]), reduced
+            avoid.normals[count, q] = n[q]
+        reduced = 1.0 / (avoid.inverse[i] + (avoid.inverse[j] if j >= 0 else 0.0))
+        avoid.missing[count], avoid.most[count] = missing_accel, 2.0 * limit * reduced
+        avoid.push[count], avoid.reduced[count] = min(avoid.last[entry], avoid.most[count]), reduced
         count += 1
     return count
 
 
 @jit
-def add_obstacle_barrier(count, i, entry, needed, a):
+def add_obstacle_barrier(count, i, entry, needed, avoid):
     """Add a barrier of vehicle i along ``normal``, if it may act; the number of them, and whether this is violated."""
-    n, c = a.normal, a.wanted[i]
+    n, c = avoid.normal, avoid.wanted[i]
     missing = needed - (n[0] * c[0] + n[1] * c[1] + n[2] * c[2])
-    if missing > -a.b[i]:
-        count = add_barrier(count, i, -1, entry, n, missing, a.b[i], a)
+    if missing > -avoid.b[i]:
+        count = add_barrier(count, i, -1, entry, n, missing, avoid.b[i], avoid)
     return count, missing > 0.0
 
 
 @jit
-def least_passing_acceleration(i, o, r, v, a):
+def least_passing_acceleration(i, o, r, v, avoid):
     """Least acceleration of vehicle i with which obstacle o, which moves, passes it; ``normal`` is its direction.
 
     Both go on straight to where they are nearest, in the time t, with a part of the distance to keep missing. An
@@ -107,36 +107,36 @@ def least_passing_acceleration(i, o, r, v, a):
     vehicle would be driven along by an obstacle that comes straight at it, until others are in its way. A wide
     obstacle, which is left in or against the direction of the way, asks for nothing: braking has to do.
     """
-    x, p, q, bound = a.sight.track[o], a.shifted[0], a.shifted[2], a.sight.bound[o]
+    x, p, q, bound = avoid.sight.track[o], avoid.shifted[0], avoid.shifted[2], avoid.sight.bound[o]
     for k in range(3):
-        p[k] = r[k] - x[k] - a.lead[i, k] * x[3 + k]
+        p[k] = r[k] - x[k] - avoid.lead[i, k] * x[3 + k]
         q[k] = p[k] + _AHEAD * (v[k] - x[3 + k])
-    keep = a.reach[i] + a.spare[i] + bound[0]
+    keep = avoid.reach[i] + avoid.spare[i] + bound[0]
     most = keep + _AHEAD * bound[1]
-    if segment_obstacle_distance(p, q, o, a.solids, most, a.normal)[1] >= most:  # quick
+    if segment_obstacle_distance(p, q, o, avoid.solids, most, avoid.normal)[1] >= most:  # quick
         return -math.inf
-    _, away, share = segment_obstacle_distance(p, q, o, a.solids, math.nan, a.normal)
+    _, away, share = segment_obstacle_distance(p, q, o, avoid.solids, math.nan, avoid.normal)
     t = _AHEAD * share
     missing = keep + t * bound[1] - away
     along = fast = 0.0
     for k in range(3):
-        along += a.normal[k] * (q[k] - p[k])
+        along += avoid.normal[k] * (q[k] - p[k])
         fast += (q[k] - p[k]) ** 2
     if missing <= 0.0 or along * along > _ACROSS * fast:
         return -math.inf
-    return 2.0 * missing / max(t - a.lag[i], a.period) ** 2
+    return 2.0 * missing / max(t - avoid.lag[i], avoid.period) ** 2
 
 
 @jit
-def list_barriers(r, v, lost, a):
+def list_barriers(r, v, lost, avoid):
     """Write the barriers that may act at this tick; returns their number, and whether one of them is violated."""
-    count, violated, n, walls = 0, False, a.normal, a.near.shape[0]
-    for i in range(a.b.shape[0]):
+    count, violated, n, walls, sight = 0, False, avoid.normal, avoid.near.shape[0], avoid.sight
+    for i in range(avoid.b.shape[0]):
         if lost[i]:
             continue
-        c = a.wanted[i]
-        for e in range(a.start[i], a.start[i + 1]):
-            j = a.near[e]
+        c = avoid.wanted[i]
+        for e in range(avoid.start[i], avoid.start[i + 1]):
+            j = avoid.near[e]
             if j < i:
                 continue
             x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
@@ -144,49 +144,49 @@ def list_barriers(r, v, lost, a):
             inverse = 1.0 / L
             n[0], n[1], n[2] = inverse * x, inverse * y, inverse * z
             X, Y, Z = v[i, 0] - v[j, 0], v[i, 1] - v[j, 1], v[i, 2] - v[j, 2]
-            s, d = n[0] * X + n[1] * Y + n[2] * Z, a.wanted[j]
-            both = a.b[i] + a.b[j]
-            gap = L - a.room[i] - a.room[j] - a.spare[i] - a.spare[j]
-            soft = a.share * (a.soft[i] + a.soft[j])
+            s, d = n[0] * X + n[1] * Y + n[2] * Z, avoid.wanted[j]
+            both = avoid.b[i] + avoid.b[j]
+            gap = L - avoid.room[i] - avoid.room[j] - avoid.spare[i] - avoid.spare[j]
+            soft = avoid.share * (avoid.soft[i] + avoid.soft[j])
             across = (X * X + Y * Y + Z * Z - s * s) * inverse
             # A point with a lag flies on for it; of a quadrotor, the point led knows its lags.
             if soft == 0.0:
-                gap -= max(0.0, -s) * max(a.lag[i], a.lag[j])
-                needed = needed_rate(gap, s, across, a.share * both, a.rate)
+                gap -= max(0.0, -s) * max(avoid.lag[i], avoid.lag[j])
+                needed = needed_rate(gap, s, across, avoid.share * both, avoid.rate)
             else:
-                needed = needed_rate(gap, s, across, a.share * both, a.rate, soft)
+                needed = needed_rate(gap, s, across, avoid.share * both, avoid.rate, soft)
             have = n[0] * (c[0] - d[0]) + n[1] * (c[1] - d[1]) + n[2] * (c[2] - d[2])
             if needed > have - both:  # one that others may yet push into it is listed, too
                 violated = violated or needed > have
-                count = add_barrier(count, i, j, e, n, needed - have, both, a)
-        for o in range(a.solids.kind.shape[0]):
-            B = a.b[i]
-            if a.sight.moves[o] == 0:
-                away = obstacle_distance(r[i, 0], r[i, 1], r[i, 2], o, a.solids, n)
-                gap = away - a.reach[i] - a.spare[i]
+                count = add_barrier(count, i, j, e, n, needed - have, both, avoid)
+        for o in range(avoid.solids.kind.shape[0]):
+            B = avoid.b[i]
+            if sight.moves[o] == 0:
+                away = obstacle_distance(r[i, 0], r[i, 1], r[i, 2], o, avoid.solids, n)
+                gap = away - avoid.reach[i] - avoid.spare[i]
                 s = n[0] * v[i, 0] + n[1] * v[i, 1] + n[2] * v[i, 2]
-            elif a.sight.known[o] == KNOWN:
-                x, bound, B = a.sight.track[o], a.sight.bound[o], relative_braking_limit(i, o, a)
+            elif sight.known[o] == KNOWN:
+                x, bound, B = sight.track[o], sight.bound[o], relative_braking_limit(i, o, avoid)
                 for q in range(3):
-                    n[q] = r[i, q] - x[q] - a.lead[i, q] * x[3 + q]
-                away = obstacle_distance(n[0], n[1], n[2], o, a.solids, n)
-                gap = away - a.reach[i] - a.spare[i] - bound[0]
+                    n[q] = r[i, q] - x[q] - avoid.lead[i, q] * x[3 + q]
+                away = obstacle_distance(n[0], n[1], n[2], o, avoid.solids, n)
+                gap = away - avoid.reach[i] - avoid.spare[i] - bound[0]
                 s = n[0] * (v[i, 0] - x[3]) + n[1] * (v[i, 1] - x[4]) + n[2] * (v[i, 2] - x[5])
                 s -= bound[1]
             else:
                 continue
-            if a.soft[i] == 0.0:
-                gap -= max(0.0, -s) * a.lag[i]
-                needed = needed_rate(gap, s, 0.0, a.share * B, a.rate)
+            if avoid.soft[i] == 0.0:
+                gap -= max(0.0, -s) * avoid.lag[i]
+                needed = needed_rate(gap, s, 0.0, avoid.share * B, avoid.rate)
             else:
-                soft = a.share * B * a.soft[i] / a.b[i]
-                needed = needed_rate(gap, s, 0.0, a.share * B, a.rate, soft)
-            entry = walls + 2 * (i * a.solids.kind.shape[0] + o)
-            count, worse = add_obstacle_barrier(count, i, entry, needed, a)
+                soft = avoid.share * B * avoid.soft[i] / avoid.b[i]
+                needed = needed_rate(gap, s, 0.0, avoid.share * B, avoid.rate, soft)
+            entry = walls + 2 * (i * avoid.solids.kind.shape[0] + o)
+            count, worse = add_obstacle_barrier(count, i, entry, needed, avoid)
             violated = violated or worse
-            if a.sight.moves[o] != 0:
-                needed = least_passing_acceleration(i, o, r[i], v[i], a)
-                count, worse = add_obstacle_barrier(count, i, entry + 1, needed, a)
+            if sight.moves[o] != 0:
+                needed = least_passing_acceleration(i, o, r[i], v[i], avoid)
+                count, worse = add_obstacle_barrier(count, i, entry + 1, needed, avoid)
                 violated = violated or worse
     return count, violated
 
@@ -201,216 +201,216 @@ def difference_along(i, j, n, x):
 
 
 @jit
-def push_apart(i, j, n, force, a):
+def push_apart(i, j, n, force, avoid):
     """Add the accelerations of a force [N] along a unit vector n (3,) on i, and against it on j if j is not -1."""
     for q in range(3):
-        a.shift[i, q] += force * a.inverse[i] * n[q]
+        avoid.shift[i, q] += force * avoid.inverse[i] * n[q]
         if j >= 0:
-            a.shift[j, q] -= force * a.inverse[j] * n[q]
+            avoid.shift[j, q] -= force * avoid.inverse[j] * n[q]
 
 
 @jit
-def edge_compliance(e, p, a):
+def edge_compliance(e, p, avoid):
     """What an edge adds to its own diagonal of A: the law's damping, and more the less it holds."""
     i, j = p.graph.edges[e, 0], p.graph.edges[e, 1]
-    hold = max(min(a.hold[i], a.hold[j]), _LOOSE)
+    hold = max(min(avoid.hold[i], avoid.hold[j]), _LOOSE)
     return p.law.mu / p.vehicles.mean + (1.0 / hold - 1.0) * p.graph.diagonal[e]
 
 
 @jit
-def enforce_barrier(k, a):
+def enforce_barrier(k, avoid):
     """Let barrier k push as it must with the present accelerations; returns the change that it makes [m/s^2]."""
-    i, j, n = a.rows[k, 0], a.rows[k, 1], a.normals[k]
-    rest = a.missing[k] - difference_along(i, j, n, a.shift)
+    i, j, n = avoid.rows[k, 0], avoid.rows[k, 1], avoid.normals[k]
+    rest = avoid.missing[k] - difference_along(i, j, n, avoid.shift)
     # Over-relaxed, then back between its bounds: projected Gauss-Seidel converges for any factor below 2.
-    push = min(max(a.push[k] + _BEYOND * rest * a.reduced[k], 0.0), a.most[k])
-    more = push - a.push[k]
+    push = min(max(avoid.push[k] + _BEYOND * rest * avoid.reduced[k], 0.0), avoid.most[k])
+    more = push - avoid.push[k]
     if more == 0.0:
         return 0.0
-    push_apart(i, j, n, more, a)
-    a.push[k] = push
-    return abs(more) * (a.inverse[i] + (a.inverse[j] if j >= 0 else 0.0))
+    push_apart(i, j, n, more, avoid)
+    avoid.push[k] = push
+    return abs(more) * (avoid.inverse[i] + (avoid.inverse[j] if j >= 0 else 0.0))
 
 
 @jit
-def update_edge_pulls(p, w, a):
+def update_edge_pulls(p, w, avoid):
     """The same for all edges."""
     change = 0.0
     for e in range(p.graph.edges.shape[0]):
         i, j, n = p.graph.edges[e, 0], p.graph.edges[e, 1], w.u[e]
-        along = difference_along(i, j, n, a.shift)
-        if along == 0.0 and a.pull[e] == 0.0:
+        along = difference_along(i, j, n, avoid.shift)
+        if along == 0.0 and avoid.pull[e] == 0.0:
             continue
-        soft, diagonal = edge_compliance(e, p, a), p.graph.diagonal[e]
-        pull = -_BEYOND * (along + soft * a.pull[e]) / (diagonal + soft)
+        soft, diagonal = edge_compliance(e, p, avoid), p.graph.diagonal[e]
+        pull = -_BEYOND * (along + soft * avoid.pull[e]) / (diagonal + soft)
         change = max(change, abs(pull) * diagonal)
-        push_apart(i, j, n, pull, a)
-        a.pull[e] += pull
+        push_apart(i, j, n, pull, avoid)
+        avoid.pull[e] += pull
     return change
 
 
 @jit
-def sweep_gauss_seidel(barrier_count, p, w, a):
+def sweep_gauss_seidel(barrier_count, p, w, avoid):
     """Projected Gauss-Seidel: a sweep over all barriers and edges, then some over those that push alone.
 
     Returns the greatest change of the first one [m/s^2].
     """
     first, pushing = 0.0, 0
     for k in range(barrier_count):
-        first = max(first, enforce_barrier(k, a))
-        if a.push[k] > 0.0:
-            a.pushing[pushing] = k
+        first = max(first, enforce_barrier(k, avoid))
+        if avoid.push[k] > 0.0:
+            avoid.pushing[pushing] = k
             pushing += 1
-    first = max(first, update_edge_pulls(p, w, a))
+    first = max(first, update_edge_pulls(p, w, avoid))
     for _ in range(_INNER if first >= _CLOSE else 0):
         change = 0.0
         for k in range(pushing):
-            change = max(change, enforce_barrier(a.pushing[k], a))
-        if max(change, update_edge_pulls(p, w, a)) < _CLOSE:
+            change = max(change, enforce_barrier(avoid.pushing[k], avoid))
+        if max(change, update_edge_pulls(p, w, avoid)) < _CLOSE:
             break
     return first
 
 
 @jit
-def matrix_entry(i, j, n_ij, k, l, n_kl, a):
+def matrix_entry(i, j, n_ij, k, l, n_kl, avoid):
     """Entry of A for two rows: unit vectors n_ij and n_kl (3,), vehicles i and j, k and l (-1: none)."""
     value = 0.0
     dot = n_ij[0] * n_kl[0] + n_ij[1] * n_kl[1] + n_ij[2] * n_kl[2]
     if i == k:
-        value += dot / a.weight[i]
+        value += dot / avoid.weight[i]
     elif i == l:
-        value -= dot / a.weight[i]
+        value -= dot / avoid.weight[i]
     if j >= 0:
         if j == k:
-            value -= dot / a.weight[j]
+            value -= dot / avoid.weight[j]
         elif j == l:
-            value += dot / a.weight[j]
+            value += dot / avoid.weight[j]
     return value
 
 
 @jit
-def solve_active_set(count, p, w, a):
+def solve_active_set(count, p, w, avoid):
     """Solve exactly for the barriers that push less than they may, and the edges, if the sweeps have found which.
 
     Returns whether the solution is one: no push is negative, and no other barrier violated.
     """
     size, m = 0, p.graph.edges.shape[0]
     for k in range(count):
-        if 0.0 < a.push[k] < a.most[k]:
+        if 0.0 < avoid.push[k] < avoid.most[k]:
             if size + m >= EXACT:
                 return False
-            a.active[size] = k
+            avoid.active[size] = k
             size += 1
     whole = size + m
     if whole == 0:
         return False
     # The unknowns are corrections of pushes, then of pulls. A push at a bound stays: the sweeps have chosen it.
     for row in range(whole):
-        i, j, n = pair_and_normal_of_row(row, size, p, w, a)
+        i, j, n = pair_and_normal_of_row(row, size, p, w, avoid)
         for column in range(row + 1):
-            k, l, other = pair_and_normal_of_row(column, size, p, w, a)
-            a.system[row, column] = matrix_entry(i, j, n, k, l, other, a)
+            k, l, other = pair_and_normal_of_row(column, size, p, w, avoid)
+            avoid.system[row, column] = matrix_entry(i, j, n, k, l, other, avoid)
         # What is left by the pushes so far and by those at their bounds
-        a.right[row] = -difference_along(i, j, n, a.shift)
+        avoid.right[row] = -difference_along(i, j, n, avoid.shift)
         if row < size:
-            a.right[row] += a.missing[a.active[row]]
+            avoid.right[row] += avoid.missing[avoid.active[row]]
         else:
-            soft = edge_compliance(row - size, p, a)
-            a.system[row, row] += soft
-            a.right[row] -= soft * a.pull[row - size]
-    if not cholesky(a.system[:whole, :whole]):
+            soft = edge_compliance(row - size, p, avoid)
+            avoid.system[row, row] += soft
+            avoid.right[row] -= soft * avoid.pull[row - size]
+    if not cholesky(avoid.system[:whole, :whole]):
         return False
-    cholesky_solve(a.system[:whole, :whole], a.right[:whole])
+    cholesky_solve(avoid.system[:whole, :whole], avoid.right[:whole])
     for row in range(size):
-        push = a.push[a.active[row]] + a.right[row]
-        if not 0.0 <= push <= a.most[a.active[row]]:
+        push = avoid.push[avoid.active[row]] + avoid.right[row]
+        if not 0.0 <= push <= avoid.most[avoid.active[row]]:
             return False
     for row in range(whole):
-        i, j, n = pair_and_normal_of_row(row, size, p, w, a)
-        push_apart(i, j, n, a.right[row], a)
+        i, j, n = pair_and_normal_of_row(row, size, p, w, avoid)
+        push_apart(i, j, n, avoid.right[row], avoid)
         if row < size:
-            a.push[a.active[row]] += a.right[row]
+            avoid.push[avoid.active[row]] += avoid.right[row]
         else:
-            a.pull[row - size] += a.right[row]
+            avoid.pull[row - size] += avoid.right[row]
     return True
 
 
 @jit
-def pair_and_normal_of_row(row, barriers, p, w, a):
+def pair_and_normal_of_row(row, barriers, p, w, avoid):
     """Vehicles and unit vector of a row of the system: of one of the ``barriers``, or after these of an edge."""
     if row < barriers:
-        k = a.active[row]
-        return a.rows[k, 0], a.rows[k, 1], a.normals[k]
+        k = avoid.active[row]
+        return avoid.rows[k, 0], avoid.rows[k, 1], avoid.normals[k]
     return p.graph.edges[row - barriers, 0], p.graph.edges[row - barriers, 1], w.u[row - barriers]
 
 
 @jit
-def solve_barriers(count, p, w, a):
+def solve_barriers(count, p, w, avoid):
     """Pushes of barriers, pulls of edges, and the changes of accelerations that they make (``shift``).
 
     It begins with the pushes of the tick before.
     """
-    for i in range(a.b.shape[0]):
+    for i in range(avoid.b.shape[0]):
         for q in range(3):
-            a.shift[i, q] = 0.0
-    for e in range(a.pull.shape[0]):
-        a.pull[e] = 0.0
+            avoid.shift[i, q] = 0.0
+    for e in range(avoid.pull.shape[0]):
+        avoid.pull[e] = 0.0
     for k in range(count):
-        if a.push[k] > 0.0:
-            push_apart(a.rows[k, 0], a.rows[k, 1], a.normals[k], a.push[k], a)
+        if avoid.push[k] > 0.0:
+            push_apart(avoid.rows[k, 0], avoid.rows[k, 1], avoid.normals[k], avoid.push[k], avoid)
     for _ in range(3):
         for _ in range(_SWEEPS):
-            if sweep_gauss_seidel(count, p, w, a) < _CLOSE:
+            if sweep_gauss_seidel(count, p, w, avoid) < _CLOSE:
                 return
-        solve_active_set(count, p, w, a)  # a sweep after it tells whether that was all
+        solve_active_set(count, p, w, avoid)  # a sweep after it tells whether that was all
 
 
 @jit
-def limit_thrust(i, a):
+def limit_thrust(i, avoid):
     """Limit the thrust of an acceleration asked for."""
-    c = a.wanted[i]
-    size = math.sqrt(c[0] * c[0] + c[1] * c[1] + (c[2] + a.g) ** 2)
-    if size > a.lift[i]:
-        share = a.lift[i] / size
-        c[0], c[1], c[2] = share * c[0], share * c[1], share * (c[2] + a.g) - a.g
-    if a.tilt[i] < math.inf:
-        c[2] += a.g
-        limit_tilt(c, a.tilt[i], a.g)
-        c[2] -= a.g
+    c = avoid.wanted[i]
+    size = math.sqrt(c[0] * c[0] + c[1] * c[1] + (c[2] + avoid.g) ** 2)
+    if size > avoid.lift[i]:
+        share = avoid.lift[i] / size
+        c[0], c[1], c[2] = share * c[0], share * c[1], share * (c[2] + avoid.g) - avoid.g
+    if avoid.tilt[i] < math.inf:
+        c[2] += avoid.g
+        limit_tilt(c, avoid.tilt[i], avoid.g)
+        c[2] -= avoid.g
 
 
 @jit
-def filter_accelerations(t, r, v, lost, p, w, a):
+def filter_accelerations(t, r, v, lost, p, w, avoid):
     """Change what is asked for as little as possible, so that all barriers hold; returns whether any did not."""
-    count, violated = list_barriers(r, v, lost, a)
-    n = a.b.shape[0]
+    count, violated = list_barriers(r, v, lost, avoid)
+    n = avoid.b.shape[0]
     if violated:
-        solve_barriers(count, p, w, a)
+        solve_barriers(count, p, w, avoid)
     for i in range(n):
         for q in range(3):
-            a.known[2, i, q] = 0.0
-    for k in range(a.last.shape[0]):
-        a.last[k] = 0.0
+            avoid.known[2, i, q] = 0.0
+    for k in range(avoid.last.shape[0]):
+        avoid.last[k] = 0.0
     for k in range(count if violated else 0):
-        a.last[a.rows[k, 2]] = a.push[k]
+        avoid.last[avoid.rows[k, 2]] = avoid.push[k]
         for side in range(2):
-            i = a.rows[k, side]
-            if i >= 0 and a.push[k] > 0.0:
+            i = avoid.rows[k, side]
+            if i >= 0 and avoid.push[k] > 0.0:
                 for q in range(3):
-                    a.known[2, i, q] += (1 - 2 * side) * a.push[k] * a.normals[k, q]
+                    avoid.known[2, i, q] += (1 - 2 * side) * avoid.push[k] * avoid.normals[k, q]
     for i in range(n):
-        push = a.known[2, i]
+        push = avoid.known[2, i]
         pushed = math.sqrt(push[0] * push[0] + push[1] * push[1] + push[2] * push[2])
         if pushed > 0.0:
-            a.acted[BARRIER, i] += 1
-            a.first[BARRIER, i] = min(a.first[BARRIER, i], t)
+            avoid.acted[BARRIER, i] += 1
+            avoid.first[BARRIER, i] = min(avoid.first[BARRIER, i], t)
         # Edges let go and take hold gradually, over `release`: forces do not jump.
-        aim = 1.0 - min(1.0, pushed / (_FULL * a.weight[i] * a.b[i]))
-        a.hold[i] += (aim - a.hold[i]) * min(1.0, a.period / a.release)
-        if a.hold[i] > 1.0 - 1e-6:
-            a.hold[i] = 1.0
+        aim = 1.0 - min(1.0, pushed / (_FULL * avoid.weight[i] * avoid.b[i]))
+        avoid.hold[i] += (aim - avoid.hold[i]) * min(1.0, avoid.period / avoid.release)
+        if avoid.hold[i] > 1.0 - 1e-6:
+            avoid.hold[i] = 1.0
         if violated:
             for q in range(3):
-                a.wanted[i, q] += a.shift[i, q]
-            limit_thrust(i, a)
+                avoid.wanted[i, q] += avoid.shift[i, q]
+            limit_thrust(i, avoid)
     return violated

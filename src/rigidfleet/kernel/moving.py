@@ -78,21 +78,21 @@ def obstacle_velocity(t, o, solids):
 
 
 @jit
-def is_in_sight(o, x, y, z, r, lost, a):
+def is_in_sight(o, x, y, z, r, lost, avoid):
     """Whether any vehicle is within sensing range of obstacle o, displaced by x, y, z [m]."""
+    solids, reach = avoid.solids, avoid.sight.reach
     for i in range(r.shape[0]):
-        if not lost[i]:
-            away = obstacle_distance(r[i, 0] - x, r[i, 1] - y, r[i, 2] - z, o, a.solids, a.normal)
-            if away <= a.sight.reach:
-                return True
+        u, v, w = r[i, 0] - x, r[i, 1] - y, r[i, 2] - z
+        if not lost[i] and obstacle_distance(u, v, w, o, solids, avoid.normal) <= reach:
+            return True
     return False
 
 
 @jit
-def track_obstacle(o, k, x, y, z, u, v, w, a):
+def track_obstacle(o, k, x, y, z, u, v, w, avoid):
     """Take a measurement of obstacle o at tick k, at the displacement x, y, z [m] with the velocity u, v, w [m/s]."""
-    s = a.sight
-    track, spread, seen = s.track[o], s.spread[o], a.shifted[0]
+    s = avoid.sight
+    track, spread, seen = s.track[o], s.spread[o], avoid.shifted[0]
     seen[0], seen[1], seen[2] = x, y, z
     if s.noise == 0.0:
         track[0], track[1], track[2], track[3], track[4], track[5] = x, y, z, u, v, w
@@ -110,22 +110,22 @@ def track_obstacle(o, k, x, y, z, u, v, w, a):
 
 
 @jit
-def update_tracks(t, r, lost, a):
+def update_tracks(t, r, lost, avoid):
     """Bring what is known of all obstacles that move to t [s], with vehicles at r (N, 3)."""
-    s, T = a.sight, a.period
+    s, T = avoid.sight, avoid.period
     k = int(t / T + 0.5)
     for o in range(s.moves.shape[0]):
         if s.moves[o] == 0:
             continue
-        if not is_solid_present(t, o, a.solids):
+        if not is_solid_present(t, o, avoid.solids):
             s.known[o] = UNKNOWN
             continue
-        x, y, z = solid_displacement(t, o, a.solids)
-        u, v, w = obstacle_velocity(t + 0.5 * T, o, a.solids)
+        x, y, z = solid_displacement(t, o, avoid.solids)
+        u, v, w = obstacle_velocity(t + 0.5 * T, o, avoid.solids)
         if s.known[o] != UNKNOWN:
             predict_track(o, T, s)
-        if not s.reach < math.inf or is_in_sight(o, x, y, z, r, lost, a):
-            track_obstacle(o, k, x, y, z, u, v, w, a)
+        if not s.reach < math.inf or is_in_sight(o, x, y, z, r, lost, avoid):
+            track_obstacle(o, k, x, y, z, u, v, w, avoid)
             s.known[o] = FOLLOWED
         if s.known[o] == UNKNOWN:
             continue
@@ -140,32 +140,32 @@ def update_tracks(t, r, lost, a):
 
 
 @jit
-def is_obstacle_known(o, a):
+def is_obstacle_known(o, avoid):
     """Whether obstacle o stands still, or moves and is known."""
-    return a.sight.moves[o] == 0 or a.sight.known[o] == KNOWN
+    return avoid.sight.moves[o] == 0 or avoid.sight.known[o] == KNOWN
 
 
 @jit
-def relative_braking_limit(i, o, a):
+def relative_braking_limit(i, o, avoid):
     """Acceleration [m/s^2] with which vehicle i can always brake relative to obstacle o, which moves."""
-    x = a.sight.track[o]
+    x = avoid.sight.track[o]
     speed = math.sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5])
-    drag = (1.0 - a.coast[i, 0]) / a.coast[i, 1]
-    return max(a.b[i] - drag * speed - a.sight.swerve, _LEAST * a.b[i])
+    drag = (1.0 - avoid.coast[i, 0]) / avoid.coast[i, 1]
+    return max(avoid.b[i] - drag * speed - avoid.sight.swerve, _LEAST * avoid.b[i])
 
 
 @jit
-def braking_relative_to_obstacle(i, o, v, a, out):
+def braking_relative_to_obstacle(i, o, v, avoid, out):
     """Acceleration (3,) that brakes vehicle i from a velocity v (3,) relative to obstacle o, straight, with drag.
 
     It bears the drag that the vehicle has at the obstacle's velocity, so that what is left acts on the relative one.
     """
-    x, E, first = a.sight.track[o], a.coast[i, 0], a.coast[i, 1]
+    x, E, first = avoid.sight.track[o], avoid.coast[i, 0], avoid.coast[i, 1]
     speed = 0.0
     for q in range(3):
         speed += (v[q] - x[3 + q]) ** 2
     speed = math.sqrt(speed)
-    size = min(relative_braking_limit(i, o, a), speed * E / first) / max(speed, 1e-12)
+    size = min(relative_braking_limit(i, o, avoid), speed * E / first) / max(speed, 1e-12)
     for q in range(3):
         out[q] = (1.0 - E) / first * x[3 + q] - size * (v[q] - x[3 + q])
 
@@ -181,59 +181,59 @@ def way_to_rest(u, b, lag, period):
 
 
 @jit
-def required_obstacle_distance(i, o, speed, braking, a):
+def required_obstacle_distance(i, o, speed, braking, avoid):
     """Distance [m] from obstacle o, which moves, to keep by the stop segment of vehicle i at a relative speed."""
-    bound = a.sight.bound[o]
-    return a.reach[i] + a.spare[i] + bound[0] + bound[1] * speed / braking
+    bound = avoid.sight.bound[o]
+    return avoid.reach[i] + avoid.spare[i] + bound[0] + bound[1] * speed / braking
 
 
 @jit
-def write_stop_relative_to_obstacle(i, o, r, v, a):
+def write_stop_relative_to_obstacle(i, o, r, v, avoid):
     """Write the relative stop segment of vehicle i to ``shifted`` 0 and 2; returns its length and relative speed."""
-    x, out = a.sight.track[o], a.shifted
+    x, out = avoid.sight.track[o], avoid.shifted
     speed = 0.0
     for q in range(3):
-        out[0, q], out[3, q] = r[q] - x[q] - a.lead[i, q] * x[3 + q], v[q] - x[3 + q]
+        out[0, q], out[3, q] = r[q] - x[q] - avoid.lead[i, q] * x[3 + q], v[q] - x[3 + q]
         speed += out[3, q] * out[3, q]
     speed = math.sqrt(speed)
-    stop = way_to_rest(speed, relative_braking_limit(i, o, a), a.lag[i], a.period)
+    stop = way_to_rest(speed, relative_braking_limit(i, o, avoid), avoid.lag[i], avoid.period)
     for q in range(3):
         out[2, q] = out[0, q] + stop / max(speed, 1e-12) * out[3, q]
     return stop, speed
 
 
 @jit
-def margin_to_moving_obstacles(i, v, a):
+def moving_obstacle_margin(i, v, avoid):
     """By how much the candidate of vehicle i keeps its distances from obstacles that move [m]; infinite if it is far.
 
     The candidate is ``trial``, the velocity before it v (3,).
     """
-    way, out, T, normal, room = a.trial, a.shifted, a.period, a.normal, math.inf
-    E, first = a.coast[i, 0], a.coast[i, 1]
-    for o in range(a.sight.moves.shape[0]):
-        if a.sight.moves[o] == 0 or a.sight.known[o] != KNOWN:
+    way, out, T, normal, room = avoid.trial, avoid.shifted, avoid.period, avoid.normal, math.inf
+    E, first, solids = avoid.coast[i, 0], avoid.coast[i, 1], avoid.solids
+    for o in range(avoid.sight.moves.shape[0]):
+        if avoid.sight.moves[o] == 0 or avoid.sight.known[o] != KNOWN:
             continue
-        x, floor = a.sight.track[o], a.walls[i, o]
+        x, floor = avoid.sight.track[o], avoid.walls[i, o]
         before = after = rise = 0.0
         for q in range(3):
             end = v[q] * E + way[3, q] * first - x[3 + q]
-            out[0, q] = way[0, q] - x[q] - a.lead[i, q] * x[3 + q]
-            out[1, q] = way[1, q] - x[q] - (a.lead[i, q] + T) * x[3 + q]
+            out[0, q] = way[0, q] - x[q] - avoid.lead[i, q] * x[3 + q]
+            out[1, q] = way[1, q] - x[q] - (avoid.lead[i, q] + T) * x[3 + q]
             out[2, q], out[3, q] = end, v[q] - x[3 + q]
             before += out[3, q] * out[3, q]
             after += end * end
             rise += way[4, q] * way[4, q]
         before, after = math.sqrt(before), math.sqrt(after)
-        stop = way_to_rest(after, relative_braking_limit(i, o, a), a.lag[i], T)
+        stop = way_to_rest(after, relative_braking_limit(i, o, avoid), avoid.lag[i], T)
         far = T * (before + 0.5 * T * math.sqrt(rise)) + stop
-        if obstacle_distance(out[0, 0], out[0, 1], out[0, 2], o, a.solids, normal) - far >= floor:
+        if obstacle_distance(out[0, 0], out[0, 1], out[0, 2], o, solids, normal) - far >= floor:
             continue
         # Three distances: of the stop segment after the tick, of the chord of the tick, and of the parabola beyond it.
         for q in range(3):
             out[2, q] = out[1, q] + stop / max(after, 1e-12) * out[2, q]
-        bound, value, _ = segment_obstacle_distance(out[1], out[2], o, a.solids, floor, normal)
+        bound, value, _ = segment_obstacle_distance(out[1], out[2], o, solids, floor, normal)
         room = min(room, (value if value < floor else bound) - floor)
-        bound, value, share = segment_obstacle_distance(out[0], out[1], o, a.solids, floor, normal)
+        bound, value, share = segment_obstacle_distance(out[0], out[1], o, solids, floor, normal)
         room = min(room, (value if value < floor else bound) - floor)
         along = rate = lift = 0.0
         for q in range(3):
@@ -245,27 +245,27 @@ def margin_to_moving_obstacles(i, v, a):
 
 
 @jit
-def miss_distance(r, v, accel, a):
+def miss_distance(r, v, accel, avoid):
     """By how much a vehicle at r with v (3,) misses all obstacles that move [m], if it holds an acceleration (3,).
 
     That is the least distance of its centre at some times, up to twice that of the nearest approach without it.
     """
     least = math.inf
-    for o in range(a.sight.moves.shape[0]):
-        if a.sight.moves[o] == 0 or a.sight.known[o] != KNOWN:
+    for o in range(avoid.sight.moves.shape[0]):
+        if avoid.sight.moves[o] == 0 or avoid.sight.known[o] != KNOWN:
             continue
-        x, w = a.sight.track[o], a.shifted[3]
+        x, w = avoid.sight.track[o], avoid.shifted[3]
         nearing = fast = 0.0
         for q in range(3):
             w[q] = v[q] - x[3 + q]
-            nearing -= (r[q] - x[q] - a.sight.centre[o, q]) * w[q]
+            nearing -= (r[q] - x[q] - avoid.sight.centre[o, q]) * w[q]
             fast += w[q] * w[q]
         until = min(2.0 * nearing / max(fast, 1e-12), _FARTHEST)
         for k in range(1, _LOOKS + 1):
-            t = max(until, a.period) * k / _LOOKS
+            t = max(until, avoid.period) * k / _LOOKS
             away = obstacle_distance(
                 r[0] - x[0] + t * (w[0] + 0.5 * t * accel[0]), r[1] - x[1] + t * (w[1] + 0.5 * t * accel[1]),
-                r[2] - x[2] + t * (w[2] + 0.5 * t * accel[2]), o, a.solids, a.normal,
+                r[2] - x[2] + t * (w[2] + 0.5 * t * accel[2]), o, avoid.solids, avoid.normal,
             )  # fmt: skip
             least = min(least, away)
     return least
@@ -275,7 +275,7 @@ def miss_distance(r, v, accel, a):
 
 
 @jit
-def steer_round_obstacles(i, r, v, a):
+def steer_round_obstacles(i, r, v, avoid):
     """Lead what vehicle i is asked for round obstacles, as a flow round balls leads a fluid; whether it does.
 
     The law asks for a velocity V = v + a / rate. With the obstacle's velocity w, the stream U = V - w that meets a
@@ -283,15 +283,15 @@ def steer_round_obstacles(i, r, v, a):
     U + (R / q)^3 / 2 (U - 3 (U . n) n) (Lamb, *Hydrodynamics*, section 92). R is that of a ball round the obstacle,
     with the vehicle, and a fifth more; nearer than R, q is R.
     """
-    s, turned, normal, ask = a.sight, False, a.normal, a.shifted[0]
+    s, turned, normal, ask = avoid.sight, False, avoid.normal, avoid.shifted[0]
     for q in range(3):
-        ask[q] = v[q] + a.wanted[i, q] / _FLOW_RATE
+        ask[q] = v[q] + avoid.wanted[i, q] / _FLOW_RATE
     for o in range(s.moves.shape[0]):
-        if not (s.ball[o] < math.inf and is_obstacle_known(o, a)):
+        if not (s.ball[o] < math.inf and is_obstacle_known(o, avoid)):
             continue
         x = s.track[o]
-        away = obstacle_distance(r[0] - x[0], r[1] - x[1], r[2] - x[2], o, a.solids, normal)
-        size = _WIDER * (s.ball[o] + a.reach[i] + a.spare[i])
+        away = obstacle_distance(r[0] - x[0], r[1] - x[1], r[2] - x[2], o, avoid.solids, normal)
+        size = _WIDER * (s.ball[o] + avoid.reach[i] + avoid.spare[i])
         share = 0.5 * (size / max(away + s.ball[o], size)) ** 3
         if share < _WEAK:
             continue
@@ -300,6 +300,6 @@ def steer_round_obstacles(i, r, v, a):
             along += (ask[q] - x[3 + q]) * normal[q]
         for q in range(3):
             turn = share * (ask[q] - x[3 + q] - 3.0 * along * normal[q])
-            a.wanted[i, q] += _FLOW_RATE * turn
+            avoid.wanted[i, q] += _FLOW_RATE * turn
         turned = True
     return turned
