@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 import rigidfleet as rf
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native, packing
+from rigidfleet.kernel.problem import Problem
 from rigidfleet.kernel.records import FROM_KNOTS, KNOTS, Trail, bernstein_basis
 from rigidfleet.mission import Mission, load_mission
 
@@ -37,7 +38,7 @@ class Watched:
         self.radius = np.broadcast_to(np.asarray(radius, dtype=float), self.n).copy()
         extra = np.zeros((*r.shape[:2], 10)) if body is None else np.concatenate(body, axis=2)
         points = np.ascontiguousarray(np.concatenate([r, v, extra], axis=2))
-        problem, _, state = packing.example_tuples()[:3]
+        problem, state = packing.example_of(Problem), packing.example_of(records.IntegratorState)
         vehicles = problem.vehicles._replace(m=np.ones(self.n))
         self.problem = problem._replace(vehicles=vehicles, body_formulation=body is not None)
         trail = Trail(

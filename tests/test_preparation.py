@@ -11,7 +11,7 @@ import pytest
 from rigidfleet import assess, simulate
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native, packing
-from rigidfleet.kernel.problem import workspace
+from rigidfleet.kernel.problem import Problem, workspace
 from rigidfleet.math import pid
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.legs import phase_spans
@@ -84,7 +84,7 @@ def examples() -> list:
     state = records.integrator(rng.normal(size=21), 1.5, rtol=1e-8, atol=np.ones(21))
     times = np.linspace(0.0, 1.0, 7)
     return [
-        workspace(3, 3), state, records.new_record(7, 3, 3), packing.example_tuples()[0],
+        workspace(3, 3), state, records.new_record(7, 3, 3), packing.example_of(Problem),
         records.Segment(2.5, True, 9, times, np.ones((7, 21)), np.ones(21)),
     ]  # fmt: skip
 

@@ -106,7 +106,7 @@ def open_problem(vehicles: fleet.Quadrotors) -> Problem:
     """A problem without edges, whose input force ``control.force`` (N, 3) [N] can be overwritten between ticks."""
     m = vehicles.m.copy()
     n = len(m)
-    return packing.example_tuples()[0]._replace(
+    return packing.example_of(Problem)._replace(
         vehicles=Vehicles(m, 1 / m, m.sum(), m.mean(), np.full(n, np.inf), False, vehicles.g),
         graph=graph(np.zeros((0, 2), dtype=np.int64), m),
         control=Control(OPEN, np.zeros((n, 3)), 0.0, 0.0, RIGID),

@@ -470,9 +470,7 @@ def _rotor_force_check(measured: Measurements, q: Quantity) -> Iterator[CheckRes
 def _saturation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Share of a phase in which a vehicle with rotors cannot give what is asked of it."""
     e, limit = measured.worst(q.name), q.limit_of(measured.mission)
-    if e is None or not any(
-        model.rotor_thrust_limit for model in measured.mission.vehicle_models or ()
-    ):
+    if e is None or not any(QUANTITIES["rotor_force"].limit_of(measured.mission)):
         return
     words = (
         f"{e.who} cannot give what is asked of it for {percent_text(e.value / 100)} of phase '{e.phase}'"
@@ -486,7 +484,7 @@ def _saturation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResu
 
 def _tilt_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Check the tilt: of vehicles with rotors always, of points where it is limited."""
-    if not any(model.rotor_thrust_limit for model in measured.mission.vehicle_models or ()):
+    if not any(QUANTITIES["rotor_force"].limit_of(measured.mission)):
         yield from _quantity_check(measured, q)
     elif (e := measured.worst(q.name)) is not None:
         yield limit_check(q, e, q.limit_of(measured.mission))

@@ -146,6 +146,13 @@ class Feedback(NamedTuple):
     hold: Annotated[Floats, Extents((4,))]  # gains after T
 
 
+#: A body at rest, and one that no regulator steers.
+REST = Motion(np.zeros(2), np.zeros((1, 6, 6)), np.eye(3))
+NO_FEEDBACK = Feedback(
+    NO_KNOTS, np.zeros((0, 4)), np.zeros((0, 4)), 0.0, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.zeros(4),
+)  # fmt: skip
+
+
 class Control(NamedTuple):
     """Input law of a phase."""
 

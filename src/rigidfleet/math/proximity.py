@@ -55,11 +55,7 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
         return separation_of_remaining(r, radius, left)
     if r.shape[1] > _MANY:
         return _closest_pair_of_many(r, radius)
-
-    def surface_distance(d: Floats, radii: Floats) -> Floats:
-        return root_of_squares(d) - radii
-
-    return _least_of_pairs(r, radius, surface_distance)
+    return _least_of_pairs(r, radius, lambda d, radii: root_of_squares(d) - radii)
 
 
 def _least_of_pairs(

@@ -18,7 +18,9 @@ from rigidfleet.errors import StoppedError
 from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.kernel.problem import (
     BODY,
+    NO_FEEDBACK,
     OPEN,
+    REST,
     RIGID,
     SHAPE,
     SOLVERS,
@@ -244,7 +246,7 @@ def plan_phase(
         # Distances are those of the slots where these have the lengths commanded.
         agree = shaping is None and phase.control == "tracking" and _agree(d1, reference.p0, edges)
         reference = reference._replace(kind=SHAPE if agree else reference.kind, d0=d0, d1=d1)
-    motion, feedback = _REST, _NO_FEEDBACK
+    motion, feedback = REST, NO_FEEDBACK
     if phase.control == "tracking":
         motion = leg.motion
     elif phase.control == "body":
@@ -378,13 +380,6 @@ def _control(mission: Mission, control: str, input_force: tuple[float, ...]) -> 
     allocation = mission.allocation
     method = RIGID if allocation.method == "rigid" else SPLITS[allocation.torque_split]
     return Control(kind, force, *mission.tracking_gains, method)
-
-
-_REST = Motion(np.zeros(2), np.zeros((1, 6, 6)), np.eye(3))
-_NO_FEEDBACK = Feedback(
-    np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4)), 0.0, np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3),
-    np.zeros(4),
-)  # fmt: skip
 
 
 def _feedback(mission: Mission, phase: Phase, goal: Pose, t0: float, arrival: float) -> Feedback:

@@ -192,15 +192,12 @@ def _min_time(
         leg = leg_from(mission, vary(time), departure)
         return use_of_limits(limits, leg.reference, leg.motion, leg.start, leg.end, fine=fine)
 
-    def greatest_limit_share(time: float) -> float:
-        """Greatest share of a limit [-], as a power that falls in proportion to the time of ways from rest to rest."""
-        return max(x.share ** (1 / x.limit.of.order) for x in reached_at(time))
-
     # At rest at both ends, every share falls with a power of the time: from a trial, the first guess is the solution.
     low, high, time = 0.0, math.inf, max(_TRIAL, shortest)
     before = math.inf
     for _ in range(_TRIES):
-        over = greatest_limit_share(time)
+        # The greatest share of a limit, as a power that falls in proportion to the time of ways from rest to rest.
+        over = max(x.share ** (1 / x.limit.of.order) for x in reached_at(time))
         if time > _STEP / 2 * low > 0.0 and over > _STALLED * before:
             low = time  # a longer time does not help: the state at the start, or a circle, is beyond the limit
             break

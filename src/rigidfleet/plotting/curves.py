@@ -142,8 +142,7 @@ def has_edges(result: Result) -> bool:
 @st.styled_figure(has_edges, "no edges")
 def distances(result: Result) -> Figure:
     """Distances of the active edges, with their references (dashed)."""
-    fig, axes = st.time_figure(result, "Distances between agents", 1, height=3.4)
-    ax = axes[0, 0]
+    fig, (ax,) = st.time_figure(result, "Distances between agents", 1, height=3.4)
     draw_edge_lengths(ax, result)
     handles = [*edge_handles(result), *_reference_handle(result.distance_reference)]
     st.draw_legend(ax, handles, "edge" if len(result.edges) <= SINGLE else "")
@@ -278,8 +277,7 @@ def draw_thrust(ax: Axes, result: Result) -> None:
 @st.styled_figure(has_thrust, "forces are not known")
 def inputs(result: Result) -> Figure:
     """Thrust of each vehicle with its limit, and enlarged."""
-    fig, axes = st.time_figure(result, "Thrust of each agent", 2)
-    above, below = axes[:, 0]
+    fig, (above, below) = st.time_figure(result, "Thrust of each agent", 2)
     draw_thrust(above, result)
     st.draw_agent_lines(below, result, result.thrust)
     below.set_ylabel("enlarged [N]")
@@ -298,8 +296,7 @@ def constraint_force(result: Result) -> Figure:
     force, tension = np.linalg.norm(result.constraint_force, axis=2), -result.multiplier
     idle = [np.nanmax(np.abs(v), initial=0.0) <= IDLE for v in (force, tension)]
     shares = [_TEXT_ROW if still else 1.0 for still in idle]
-    fig, axes = st.time_figure(result, "Constraint force", 2, shares=shares)
-    above, below = axes[:, 0]
+    fig, (above, below) = st.time_figure(result, "Constraint force", 2, shares=shares)
     above.set_ylabel("constraint force [N]")
     if Panel(above, result, force, "N", result.extreme("constraint_force")).draw():
         st.draw_agents_legend(above, result.n_agents)
@@ -318,8 +315,8 @@ def constraint_force(result: Result) -> Figure:
 @st.styled_figure(lambda result: result.disturbance_force is not None, "still air")
 def disturbance(result: Result) -> Figure:
     """Aerodynamic force on each vehicle, and distance of each vehicle from its slot."""
-    fig, axes = st.time_figure(result, "Aerodynamic force, and distance from the slots", 2)
-    above, below = axes[:, 0]
+    title = "Aerodynamic force, and distance from the slots"
+    fig, (above, below) = st.time_figure(result, title, 2)
     above.set_ylabel("aerodynamic force [N]")
     assert result.disturbance_force is not None
     force = np.where(result.left, np.linalg.norm(result.disturbance_force, axis=2), np.nan)
@@ -389,8 +386,8 @@ def draw_constraint_error(ax: Axes, result: Result) -> list[Line2D]:
 def constraint_error(result: Result) -> Figure:
     """Constraint error |c| of each edge (length minus reference), and shape error of all pairs."""
     title = "Constraint error, and shape error" if has_edges(result) else "Shape error"
-    fig, axes = st.time_figure(result, f"{title} of all pairs against the slots", 1, height=3.6)
-    ax = axes[0, 0]
+    title = f"{title} of all pairs against the slots"
+    fig, (ax,) = st.time_figure(result, title, 1, height=3.6)
     if handles := draw_constraint_error(ax, result):
         st.draw_legend(ax, [*handles, *(edge_handles(result) if len(result.edges) else [])])
     return fig
@@ -472,7 +469,7 @@ def clearance(result: Result) -> Figure:
     names = _least_distance_quantities(result)
     height = 3.2 if len(names) == 1 else 1.8
     fig, axes = st.time_figure(result, "Clearance between surfaces", len(names), height=height)
-    for name, ax in zip(names, axes[:, 0], strict=True):
+    for name, ax in zip(names, axes, strict=True):
         draw_least(ax, result, name)
     return fig
 
@@ -490,8 +487,8 @@ def motion(result: Result) -> Figure:
     """Speed, acceleration and jerk of each vehicle, as far as they are limited, with their limits."""
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]
     fig, axes = st.time_figure(result, "Speed, acceleration and jerk", len(drawn), height=1.8)
-    for q, ax in zip(drawn, axes[:, 0], strict=True):
+    for q, ax in zip(drawn, axes, strict=True):
         ax.set_ylabel(f"{q.name_in_words.replace(' ', chr(10))} [{display_unit(q.unit)}]")
         quadrotors.draw_with_limit(ax, result, q.name)
-    st.draw_agents_legend(axes[0, 0], result.n_agents)
+    st.draw_agents_legend(axes[0], result.n_agents)
     return fig

@@ -24,8 +24,7 @@ _DIVERGES = 1e4
 )
 def messages(result: Result) -> Figure:
     """Age of the oldest message that each vehicle goes by, and the force by which the group pushes itself."""
-    fig, axes = st.time_figure(result, "Messages of neighbours", 2)
-    above, below = axes[:, 0]
+    fig, (above, below) = st.time_figure(result, "Messages of neighbours", 2)
     above.set_ylabel("oldest message [s]")
     below.set_ylabel("sum of all\nconstraint forces [N]")
     net = result.mission.network

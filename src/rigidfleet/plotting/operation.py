@@ -38,8 +38,7 @@ def operation(result: Result, agents: Sequence[int] = ()) -> Figure:
     n = result.n_agents
     if beyond := [i for i in agents if not 1 <= i <= n]:
         raise ValueError(f"there is no agent {beyond[0]}; agents are numbered from 1 to {n}")
-    fig, axes = st.time_figure(result, "Operation", 5, height=1.6)
-    above, fast, climb, apart, clear = axes[:, 0]
+    fig, (above, fast, climb, apart, clear) = st.time_figure(result, "Operation", 5, height=1.6)
     v = result.velocity
     limits = result.mission.limits
     for ax, words, values in (

@@ -57,8 +57,7 @@ def _rotor_nearest_to_limit(result: Result, limits: Floats) -> Extremum | None:
 @st.styled_figure(has_rotors, "no rotors")
 def rotors(result: Result) -> Figure:
     """Greatest force of a rotor of each vehicle as a share of its limit; all rotors of the one nearest to its limit."""
-    fig, axes = st.time_figure(result, "Force of the rotors", 2)
-    above, below = axes[:, 0]
+    fig, (above, below) = st.time_figure(result, "Force of the rotors", 2)
     _draw_greatest_rotor(above, result)
     st.draw_agents_legend(above, result.n_agents)
     _draw_rotors_of_nearest(below, result)
@@ -105,8 +104,7 @@ def vehicles(result: Result) -> Figure:
         saturated = (result.saturated != 0) & result.left
     shares = (1.0, 1.0, 0.6 if saturated.any() else _TEXT_ROW)
     title = "Tilt, tracking error and saturation of the vehicles"
-    fig, axes = st.time_figure(result, title, 3, height=1.9, shares=shares)
-    above, middle, below = axes[:, 0]
+    fig, (above, middle, below) = st.time_figure(result, title, 3, height=1.9, shares=shares)
     above.set_ylabel("tilt [deg]")
     draw_with_limit(above, result, "tilt", tilt(result))
     st.draw_agents_legend(above, result.n_agents)

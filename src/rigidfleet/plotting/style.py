@@ -96,7 +96,7 @@ def styled_figure(
                     return draw(result, *more, **named)
                 name = getattr(draw, "__name__", "").replace("_", " ")
                 fig, axes = time_figure(result, name.capitalize(), 1)
-                mark_empty(axes[0, 0], nothing)
+                mark_empty(axes[0], nothing)
                 return fig
 
         vars(draw_in_style)["there"] = there
@@ -162,7 +162,10 @@ def time_figure(
     height: float = 2.1,
     shares: Sequence[float] | None = None,
 ) -> tuple[Figure, Any]:
-    """Figure with rows x columns axes (object array) that share time; `height` of a row [in], scaled by its share."""
+    """Figure with axes that share time; `height` of a row [in], scaled by its share.
+
+    The axes are an object array (rows,), or (rows, columns) if there are several columns.
+    """
     shares = [1.0] * rows if shares is None else shares
     # The second column then stands below the first.
     stacked = (columns, rows) if is_narrow() else None
@@ -183,7 +186,7 @@ def time_figure(
         ax.set_xlabel("time [s]")
     axes = axes.reshape(stacked).T if stacked else axes
     _name_phases(axes[0], result)
-    return fig, axes
+    return fig, axes if axes.shape[1] > 1 else axes[:, 0]
 
 
 def phase_targets(result: Result) -> list[tuple[PhaseRecord, dict[str, Any]]]:

@@ -129,7 +129,8 @@ class CurveWatch:
         The first 3N are positions [m], the others velocities [m/s], world axes.
         """
         # Of a problem, the monitor of curves reads how many vehicles there are, and of an integrator the trail alone.
-        problem, work, state = packing.example_tuples()[:3]
+        problem, work = packing.example_of(Problem), packing.example_of(Workspace)
+        state = packing.example_of(records.IntegratorState)
         problem = problem._replace(vehicles=problem.vehicles._replace(m=np.ones(self.n)))
         trail = state.trail._replace(clock=clock, points=points)
         if "monitor" not in vars(self):

@@ -265,8 +265,7 @@ def metrics_over_drivers(table: Table) -> Figure | None:
         centres, low, middle, high = _running_percentiles(x[np.isfinite(y)], y[np.isfinite(y)])
         ax.fill_between(centres, low, high, color=st.INK, alpha=0.12, linewidth=0)
         ax.plot(centres, middle, color=st.INK)
-        scale = _axis_scale(y[np.isfinite(y)])
-        ax.set_yscale(scale)
+        ax.set_yscale(_axis_scale(y[np.isfinite(y)]))
         if _scale_of_variation(table, over) == "log":
             ax.set_xscale("log")
             _set_log_ticks(ax.xaxis, x)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rigidfleet.kernel.compiler.levels import HOST, KEY, target_instruction_level
+from rigidfleet.kernel.engine.packing import OF_LARGE
 
 #: The functions of each library of machine code, by name, with how many words they take: integers, or addresses of
 #: named tuples. What they return is a word. Flights of points load the first library, those of vehicles the second,
@@ -30,14 +31,8 @@ ENTRIES = {
     "sampled": {"fly_ticks": 5},
     "avoidance": {"avoid": 4},  # flight, state, avoidance, 0
     "solids": {"watch_trail_clearances": 6},  # first, end, problem, integrator, monitor, solids
-    "large": dict.fromkeys(
-        (
-            "solve", "multipliers", "elimination_tree", "count_factor_blocks", "list_factor_blocks", "assemble",
-            "factor", "add_J_product", "add_Jt_product", "inner", "project_on_past_solutions",
-            "conjugate_gradients", "conjugate_gradients_single",
-        ), 1
-    ),
-}  # fmt: skip
+    "large": dict.fromkeys(OF_LARGE, 1),
+}
 
 
 def symbol_name(name: str) -> str:

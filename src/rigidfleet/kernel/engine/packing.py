@@ -8,43 +8,41 @@ import threading
 from collections import namedtuple
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from rigidfleet.kernel import fleet
-from rigidfleet.kernel.avoidance import AvoidanceArrays, avoidance_arrays
-from rigidfleet.kernel.measured import Measured, measurement_arrays
+from rigidfleet.kernel.avoidance import avoidance_arrays
+from rigidfleet.kernel.measured import measurement_arrays
 from rigidfleet.kernel.problem import (
     CONSTANT,
     ITERATED,
+    NO_FEEDBACK,
     OPEN,
+    REST,
     RIGID,
     ConstraintLaw,
     Control,
-    Feedback,
-    Motion,
     Problem,
     Reference,
     Vehicles,
-    Workspace,
     graph,
     no_disturbance,
 )
 from rigidfleet.kernel.problem import workspace as kernel_workspace
 from rigidfleet.kernel.records import (
-    IntegratorState,
-    Monitor,
     Order,
     Pattern,
-    Record,
     Recursion,
     Segment,
     integrator,
     new_monitor,
     new_record,
 )
-from rigidfleet.solids.records import Solids, half_space, one_solid
+from rigidfleet.solids.records import half_space, one_solid
+
+T = TypeVar("T")
 
 
 class Packed(NamedTuple):
@@ -149,29 +147,15 @@ def _word_layout(kind: type) -> tuple[list[Any], struct.Struct]:
     return kinds, struct.Struct("=" + "".join("d" if type(x) is float else "q" for x in words))
 
 
-def example_of(kind: type) -> Any:
-    """The example of a type of named tuple."""
-    return next(x for x in (*example_tuples(), *_large_solver_examples()) if isinstance(x, kind))
+def example_of(kind: type[T]) -> T:
+    """The example of a type of named tuple; its fields have the types that all have."""
+    return next(x for x in (*_examples(), *_large_solver_examples()) if isinstance(x, kind))
 
 
 @cache
-def example_tuples() -> tuple[
-    Problem,
-    Workspace,
-    IntegratorState,
-    Segment,
-    Record,
-    Monitor,
-    fleet.SampledFlight,
-    fleet.SampledState,
-    fleet.SampledSegment,
-    AvoidanceArrays,
-    Measured,
-    Recursion,
-    Solids,
-]:
-    """One minimal example of each named tuple; its fields have the types that all have."""
-    one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)
+def _examples() -> tuple[Any, ...]:
+    """One minimal example of each named tuple that machine code takes."""
+    one, none, places = np.ones(1), np.zeros(0), np.zeros((1, 3))
     problem = Problem(
         body_formulation=False,
         has_frame=False,
@@ -179,10 +163,8 @@ def example_tuples() -> tuple[
         graph=graph(np.zeros((0, 2), dtype=np.int64), one),
         law=ConstraintLaw(0.0, 0.0, 0.0, ITERATED, 0.0, 0, 0.0, 0.0, 0.0),
         reference=Reference(CONSTANT, 0.0, 0.0, none, none, places, places, np.zeros(3)),
-        motion=Motion(np.zeros(2), np.zeros((1, 6, 6)), frame),
-        feedback=Feedback(
-            none, np.zeros((0, 4)), np.zeros((0, 4)), 0.0, *np.zeros((2, 3)), frame, np.zeros(3), np.zeros(4)
-        ),
+        motion=REST,
+        feedback=NO_FEEDBACK,
         control=Control(OPEN, places, 0.0, 0.0, RIGID),
         disturbance=no_disturbance(one),
     )  # fmt: skip
