@@ -268,3 +268,15 @@ def test_a_copy_of_what_is_packed_has_the_addresses_of_its_own_arrays():
     np.testing.assert_array_equal(
         other.compute_lazy_values().constraint_force, result.compute_lazy_values().constraint_force
     )
+
+
+@pytest.mark.parametrize("name", ["crazyflies", "cube-by-neighbours", "narrow-passage-found"])
+def test_a_mission_whose_flight_has_begun_can_be_pickled(name):
+    """What a flight has made of it stays behind: its legs hold functions, which no pickle takes."""
+    mission = load_mission(name)
+    flight = Flight(mission)
+    assert flight.begin()
+    for flown in (mission, flight.mission):
+        copied = pickle.loads(pickle.dumps(flown))
+        assert copied.to_dict() == flown.to_dict()
+        assert Flight(copied).begin()

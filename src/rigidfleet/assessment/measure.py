@@ -248,7 +248,7 @@ class Measurements:
             **{key: getattr(record, key) for key in _OF_RECORD},
             finished=finished and not record.abandoned,
             constraint=_greatest_size(result.constraint[self.parts[index]][-1:]),
-            distances=self.shape_errors_and_fits[0].get(index),
+            distances=self.shape_error_at_end(index),
             shape=None if fit is None else fit.error,
             handedness=None if fit is None or fit.dimension < 3 else not fit.is_mirrored,
             flip=self.axis_errors_at_end.get(index),
@@ -274,32 +274,33 @@ class Measurements:
         kept &= mission.has_link(edges, float(self.result.time[k]))
         return edges[kept], intended[kept]
 
+    def shape_error_at_end(self, index: int) -> float | None:
+        """Greatest error [m] of an edge against the formation at the end of a phase, if it has one."""
+        name = self.result.phases[index].formation
+        if name is None or index not in self.flown:
+            return None
+        k = self.parts[index].stop - 1
+        edges, intended = self.edges_at_sample(name, k)
+        off = proximity.pair_distances(self.result.position[[k]], edges)[:, 0] - intended
+        return _greatest_size(off)
+
     @cached_property
-    def shape_errors_and_fits(self) -> tuple[dict[int, float | None], dict[int, Fit]]:
-        """Greatest errors [m] of edges against the formation at the end of each phase that has one, and its fits."""
-        result, mission, errors, fits = self.result, self.mission, {}, {}
+    def fits_at_end(self) -> dict[int, Fit]:
+        """Fits of the formations at the end of each phase that has one; those of one formation at once."""
+        result, mission, fits = self.result, self.mission, {}
         alike: dict[tuple[str, bytes], list[tuple[int, int]]] = {}
         for index, k in zip(self.flown, self.last, strict=True):
-            if (name := result.phases[index].formation) is None:
-                continue
-            edges, intended = self.edges_at_sample(name, k)
-            off = proximity.pair_distances(result.position[[k]], edges)[:, 0] - intended
-            errors[index] = _greatest_size(off)
-            if np.isfinite(result.position[k]).all():
+            name = result.phases[index].formation
+            if name is not None and np.isfinite(result.position[k]).all():
                 alike.setdefault((name, self.left[k].tobytes()), []).append((index, k))
-        for (name, _), phases in alike.items():  # those of one formation at once
+        for (name, _), phases in alike.items():
             left, slots = np.flatnonzero(self.left[phases[0][1]]), mission.formation_slots(name)
             if slots is not None and len(left) > 1:
                 most = mission.formations[name].greatest_error
                 indices, last = map(list, zip(*phases, strict=True))
                 each = fits_by_sample(result.position[last][:, left], slots[left], left, most)
                 fits.update(zip(indices, each, strict=True))
-        return errors, fits
-
-    @property
-    def fits_at_end(self) -> dict[int, Fit]:
-        """Fits of the formations at the end of each phase."""
-        return self.shape_errors_and_fits[1]
+        return fits
 
     @cached_property
     def axis_errors_at_end(self) -> dict[int, float | None]:

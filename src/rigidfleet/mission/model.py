@@ -71,9 +71,7 @@ def _compute_once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
 
     @wraps(method)
     def wrapper(self: Mission, name: Any) -> A:
-        if (key := (wrapper.__name__, name)) not in self._made:
-            self._made[key] = method(self, name)
-        made = self._made[key]
+        made = part_of_mission(self, method, name)
         return made if made is None or made.dtype.kind == "i" else made.copy()
 
     return wrapper
@@ -390,6 +388,12 @@ class Mission(Contents, Shown):
     @cached_property
     def _made(self) -> dict[tuple[Any, ...], Any]:
         return {}
+
+    def __getstate__(self) -> dict[Any, Any]:
+        """What is pickled: not what was made of it, which may hold functions."""
+        state = super().__getstate__()
+        own = {key: x for key, x in state["__dict__"].items() if key != "_made"}
+        return state | {"__dict__": own}
 
     @_compute_once
     def _slots_in_own_order(self, name: str) -> Floats | None:

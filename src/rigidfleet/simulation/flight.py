@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -85,19 +84,6 @@ class Progress:
     phase: str
     wall: float
     planning: bool = False
-
-
-#: Missions flown last, as they were given and with their times known: to find ways takes longer than to fly them.
-_timed: deque[tuple[Mission, Mission]] = deque(maxlen=8)
-
-
-def _fill_in_times(mission: Mission) -> Mission:
-    """A mission with its times known."""
-    if (timed := next((timed for own, timed in tuple(_timed) if own is mission), None)) is None:
-        timed = complete_times(mission)
-        if timed is not mission:
-            _timed.append((mission, timed))
-    return timed
 
 
 class FlightInterrupted(KeyboardInterrupt):
@@ -188,6 +174,12 @@ def simulate(
     return flight.finish()
 
 
+def _with_times(mission: Mission) -> Mission | None:
+    """The mission with its times known; None if it is that already, so that none holds itself."""
+    timed = complete_times(mission)
+    return None if timed is mission else timed
+
+
 def _first_leg(mission: Mission, anywhere: bool) -> Leg:
     """The leg of a mission's first phase: made once, the shortest flights that are repeated save a quarter."""
     return timed_leg(mission, mission.phases[0], state_at_start(mission), 0, anywhere=anywhere)
@@ -241,7 +233,9 @@ class Flight:
         ``sampler`` chooses the times to record (`rigidfleet.simulation.sampling`); ``flips`` allows a formation to
         flip over.
         """
-        self.mission = mission = _fill_in_times(as_mission(mission))
+        mission = as_mission(mission)
+        # To find ways takes longer than to fly them.
+        self.mission = mission = part_of_mission(mission, _with_times) or mission
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
         for name, function in (
