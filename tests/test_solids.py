@@ -12,6 +12,7 @@ from rigidfleet.errors import MissionError
 from rigidfleet.math import proximity
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import Mission, load_mission
+from rigidfleet.mission.obstacles import Box
 from rigidfleet.plotting import plot, space
 from rigidfleet.preflight.check import check
 from rigidfleet.result import Result
@@ -194,6 +195,15 @@ def test_a_solid_is_where_its_waypoints_say():
     found = np.array(distance.solid_displacement(t, 0, s))
     expected = [np.interp(t, times, ways[:, q]) for q in range(3)]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 30.0])
+def test_waypoints_lead_the_centre_of_a_box(yaw):
+    """A box, turned or not, begins where its corners place it if the first waypoint is the middle between them."""
+    box = Box(
+        kind="box", min=(4, 0, 0), max=(6, 2, 4), yaw_deg=yaw, waypoints=((5, 1, 2), (9, 1, 3)), times=(0, 5)
+    )  # fmt: skip
+    np.testing.assert_array_equal(box.solid.ways, [[0, 0, 0], [4, 0, 1]])
 
 
 @pytest.mark.parametrize("name", [name for name in FORMS if name != "ground"])

@@ -133,8 +133,8 @@ class Box(Moving):
         return records.box(self.min, self.max, dcm_from_euler(angles) if self.is_turned else None)
 
     @property
-    def centre_of_form(self) -> Any:
-        """The box's centre (3,) [m]."""
+    def undisplaced_centre(self) -> Any:
+        """The box's centre (3,) [m], which is no origin of axes unless the box is turned."""
         return (np.array(self.min) + np.array(self.max)) / 2
 
 
