@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidfleet.solids import records
 from rigidfleet.solids.distance import solid_displacement
-from rigidfleet.solids.records import CYLINDER, HEIGHTS, HULL, Solids, box_corners
+from rigidfleet.solids.records import CYLINDER, HEIGHTS, HULL, Solids, triangles_of_squares
 from rigidfleet.typing import Floats
 
 #: Number of sides of a circle.
@@ -49,9 +50,9 @@ def displacements_at(solid: Solids, times: Floats) -> Floats:
 
 
 def _box_outline(size: Floats) -> Outline:
-    corner = box_corners(size[:3], size[3:])
+    corner = records.box_corners(size[:3], size[3:])
     faces = [(1, 5, 7, 3), (0, 2, 6, 4), (0, 4, 5, 1), (2, 3, 7, 6), (4, 6, 7, 5), (0, 1, 3, 2)]
-    triangles = corner[[[a, b, c] for a, b, c, _ in faces] + [[a, c, d] for a, _, c, d in faces]]
+    triangles = triangles_of_squares(*corner[np.transpose(faces)])
     edges = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
     return Outline(triangles, corner[edges])
 
@@ -62,13 +63,8 @@ def _revolve(profile: Floats) -> Outline:
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rings = np.empty((len(profile), _SIDES + 1, 3))
     rings[..., :2], rings[..., 2] = profile[:, None, :1] * circle, profile[:, 1:]
-    a, b, c, d = (
-        x.reshape(-1, 3) for x in (rings[:-1, :-1], rings[:-1, 1:], rings[1:, 1:], rings[1:, :-1])
-    )
-    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    size = np.linalg.norm(
-        np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
-    )
+    triangles = triangles_of_squares(rings[:-1, :-1], rings[:-1, 1:], rings[1:, 1:], rings[1:, :-1])
+    size = np.linalg.norm(records.normals_of(triangles), axis=1)
     triangles = triangles[size > 1e-12 * max(float(size.max()), 1e-300)]
     if len(profile) == 4:  # a cylinder: its rims, and a few lines along it
         kept = rings[1:3]
@@ -82,7 +78,7 @@ def _revolve(profile: Floats) -> Outline:
 
 def _creases(triangles: Floats) -> Floats:
     """Edges (L, 2, 3) between faces that do not lie in one plane."""
-    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normal = records.normals_of(triangles)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     sides: dict[tuple[tuple[float, ...], ...], list[int]] = {}
     for t, points in enumerate(triangles.tolist()):
@@ -97,8 +93,7 @@ def _height_map_outline(solid: Solids) -> Outline:
     z, size = solid.heights.reshape(solid.grid[0]), solid.size[0]
     x, y = (np.linspace(0.0, size[3 + k], n) for k, n in enumerate(z.shape))
     top = np.stack([*np.meshgrid(x, y, indexing="ij"), z], axis=-1)
-    a, b, c = solid.triangles.swapaxes(0, 1)
-    faces = solid.triangles[np.cross(b - a, c - a)[:, 2] >= 0.0]  # without the bottom
+    faces = solid.triangles[records.normals_of(solid.triangles)[:, 2] >= 0.0]  # without the bottom
     faces[..., 2] = np.maximum(faces[..., 2], z.min())
     pick = [np.unique(np.linspace(0, n - 1, min(n, 13)).round().astype(int)) for n in z.shape]
     rows = [*top[pick[0]], *top[:, pick[1]].swapaxes(0, 1)]

@@ -120,8 +120,7 @@ def hull(points: ArrayLike) -> Form:
     except QhullError as error:
         raise ValueError("the points lie in a plane") from error
     corners = about[convex.simplices]  # (T, 3, 3), the order of corners as Qhull happens to give it
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inwards = np.einsum("ta,ta->t", normal, convex.equations[:, :3]) < 0
+    inwards = np.einsum("ta,ta->t", normals_of(corners), convex.equations[:, :3]) < 0
     corners[inwards] = corners[inwards][:, [0, 2, 1]]
     low, high = about.min(axis=0), about.max(axis=0)
     return Form(HULL, origin, _UPRIGHT, [*low, *high], triangles=corners)
@@ -138,7 +137,7 @@ def height_map(corner: ArrayLike, spacing: ArrayLike, heights: ArrayLike, base: 
     top = np.stack([i * x, j * y, z], axis=-1)
     low = top.copy()
     low[..., 2] = base
-    faces = [_surface_triangles(top)]
+    faces = [triangles_of_squares(top[:-1, :-1], top[1:, :-1], top[1:, 1:], top[:-1, 1:])]
     for rim, under in (
         (top[0], low[0]), (top[-1, ::-1], low[-1, ::-1]), (top[::-1, 0], low[::-1, 0]), (top[:, -1], low[:, -1]),
     ):  # fmt: skip
@@ -151,11 +150,14 @@ def height_map(corner: ArrayLike, spacing: ArrayLike, heights: ArrayLike, base: 
     return Form(HEIGHTS, origin, _UPRIGHT, size, triangles=np.concatenate(faces), heights=z)
 
 
-def _surface_triangles(top: Floats) -> Floats:
-    """Triangles (M, 3, 3) of the surface of a height map of grid points (I, J, 3); corners anticlockwise from above."""
-    a, b, c, d = (
-        x.reshape(-1, 3) for x in (top[:-1, :-1], top[1:, :-1], top[1:, 1:], top[:-1, 1:])
-    )
+def normals_of(triangles: Floats) -> Floats:
+    """Normals (T, 3) of triangles (T, 3, 3), anticlockwise from their ends, twice as long as the areas are large."""
+    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+
+
+def triangles_of_squares(*corners: Floats) -> Floats:
+    """Triangles (2 K, 3, 3) of K squares, of which the first, second, third and fourth corners (..., 3) are given."""
+    a, b, c, d = (x.reshape(-1, 3) for x in corners)
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
