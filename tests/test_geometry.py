@@ -13,7 +13,7 @@ from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.measured import Measured, measurement_arrays
 from rigidfleet.math import attitude, constraint_jacobian, proximity, rigid_body
-from rigidfleet.mission import Box, Ground
+from rigidfleet.mission.obstacles import Box, Ground
 
 seeds = st.integers(0, 2**32 - 1)
 

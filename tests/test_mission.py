@@ -16,7 +16,6 @@ from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import MissionError
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.mission import (
-    Box,
     Fly,
     Mission,
     json_schema,
@@ -24,6 +23,7 @@ from rigidfleet.mission import (
     mission_names,
     mission_text,
 )
+from rigidfleet.mission.obstacles import Box
 
 SHIPPED = [
     "bridge-inspection",

@@ -17,7 +17,8 @@ from rigidfleet import plotting
 from rigidfleet._common.quantities import MOTIONS, QUANTITIES
 from rigidfleet.assessment import Verdict, safety
 from rigidfleet.cli import app as cli
-from rigidfleet.mission import Limits, json_schema
+from rigidfleet.mission import json_schema
+from rigidfleet.mission.schema import Limits
 from rigidfleet.preflight.findings import Preflight
 from rigidfleet.reporting import report_page
 from rigidfleet.result import Result

@@ -16,7 +16,8 @@ from rigidfleet.errors import FlightError
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.kernel.problem import SHAPE, SQUARED
 from rigidfleet.math import attitude, lqr
-from rigidfleet.mission import Establish, Mission, load_mission, mission_names
+from rigidfleet.mission import Mission, load_mission, mission_names
+from rigidfleet.mission.kinds import Establish
 from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import ByEdge, PhaseState, reference_kind

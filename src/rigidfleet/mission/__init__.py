@@ -5,37 +5,21 @@ key, the value and the remedy. Everything that a user sees counts from 1, as in 
 the entries in a key such as `phases[3].until`. Arrays that `Mission` returns count agents from 0.
 """
 
-from rigidfleet.mission.kinds import KINDS, Establish, Fly, Hold, Phase, Reshape, Settle
+from rigidfleet.mission.kinds import KINDS, Fly, Phase, Settle
 from rigidfleet.mission.loading import as_mission, json_schema, load_mission
 from rigidfleet.mission.model import Mission
-from rigidfleet.mission.obstacles import (
-    Box,
-    Ground,
-    Obstacle,
-)
-from rigidfleet.mission.schema import (
-    Geofence,
-    Gusts,
-    Limits,
-    Regulator,
-)
+from rigidfleet.mission.obstacles import Obstacle
+from rigidfleet.mission.schema import Gusts, Regulator
 from rigidfleet.mission.text import mission_names, mission_text
 
 __all__ = [
     "KINDS",
-    "Box",
-    "Establish",
     "Fly",
-    "Geofence",
-    "Ground",
     "Gusts",
-    "Hold",
-    "Limits",
     "Mission",
     "Obstacle",
     "Phase",
     "Regulator",
-    "Reshape",
     "Settle",
     "as_mission",
     "json_schema",

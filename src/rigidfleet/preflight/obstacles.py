@@ -9,8 +9,9 @@ import numpy as np
 
 from rigidfleet._common.quantities import PLACES, QUANTITIES
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.mission import Box, Ground, Mission, Obstacle
+from rigidfleet.mission import Mission, Obstacle
 from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
+from rigidfleet.mission.obstacles import Box, Ground
 from rigidfleet.planning.clearance import CLOSE, clearance_to, speed_bounds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import SLACK, Preflight, Remark, names_with_verb

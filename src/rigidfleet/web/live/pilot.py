@@ -15,7 +15,8 @@ import numpy as np
 from rigidfleet.errors import FlightError
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
-from rigidfleet.mission import Establish, Hold, Mission, Phase, Reshape
+from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission.kinds import Establish, Hold, Reshape
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.reference import Pose
 from rigidfleet.result import Result
