@@ -77,7 +77,6 @@ def page_contents(
         "flights": pages,
         **first,
         "figures": [] if several else [_figure_for_page(flights[0], name) for name in drawn],
-        "passed": all(verdict.passed for verdict in judged),
         "safety": _safety_table(flights, judged, names),
         "numbers": _number_comparison_table(flights, judged, names) if several else None,
         "keys": _differing_keys_table(missions, names) if several else None,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._common.plain import to_json_data
 from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math.constraint_jacobian import jacobian
@@ -102,22 +103,15 @@ class Rigidity:
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON, agents and edges counted from 1."""
-        flexes = [
-            {"agents": [i + 1 for i in flex.agents], "motion": flex.motion.tolist()}
-            for flex in self.flexes
-        ]
-        return {field.name: getattr(self, field.name) for field in fields(self)} | {
+        flexes = [{"agents": [i + 1 for i in x.agents], "motion": x.motion} for x in self.flexes]
+        data = {field.name: getattr(self, field.name) for field in fields(self)} | {
             "edges": len(self.edges),
-            "redundant": (self.edges[self.redundant] + 1).tolist(),
-            "spare": (self.edges[self.spare] + 1).tolist(),
+            "redundant": self.edges[self.redundant] + 1,
+            "spare": self.edges[self.spare] + 1,
             "flexes": flexes,
-            "index": None if np.isnan(self.index) else self.index,
-            "w": None if np.isnan(self.index) else self.w,
-            "rigidity_class": str(self.rigidity_class),
-            "stress": None if self.stress is None else self.stress.tolist(),
-            "deformed": None if self.deformed is None else self.deformed.tolist(),
-            "within": None if self.within is None else self.within.data(),
+            "w": self.w,
         }
+        return to_json_data(data)
 
 
 def analyse(

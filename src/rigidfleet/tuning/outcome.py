@@ -121,8 +121,7 @@ class Tuned(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain data; quantities that are not finite are None."""
-        before, after = ({k: m.data() for k, m in side.items()} for side in self.margins)
-        seen = self.validation
+        seen, (before, after) = self.validation, self.margins
         data = {
             "result": {
                 "mission": self.mission, "objective": self.objective, "improvement": self.improvement,
