@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -36,11 +37,10 @@ def svg_outlines(path: str | Path, notes: list[str] | None = None) -> list[Float
     RigidfleetError
         svgelements is not installed, or (MissionError) the file cannot be read.
     """
-    try:
-        from rigidfleet.formation.drawings import Drawing
-    except ImportError:
-        needed = "Drawings need svgelements. Install it: pip install svgelements."
-        raise RigidfleetError(needed) from None
+    if find_spec("svgelements") is None:
+        raise RigidfleetError("Drawings need svgelements. Install it: pip install svgelements.")
+    from rigidfleet.formation.drawings import Drawing
+
     data = read_bytes(path)
     try:
         drawing = Drawing(data)
@@ -85,11 +85,11 @@ def stroke_outlines(words: str, font: str = "futural") -> list[Floats]:
     RigidfleetError
         Hershey-Fonts is not installed.
     """
-    try:
-        from HersheyFonts import HersheyFonts
-    except ImportError:
+    if find_spec("HersheyFonts") is None:
         needed = "Words of strokes need Hershey-Fonts. Install it: pip install Hershey-Fonts."
-        raise RigidfleetError(needed) from None
+        raise RigidfleetError(needed)
+    from HersheyFonts import HersheyFonts
+
     letters = HersheyFonts()
     letters.load_default_font(font)
     letters.normalize_rendering(1.0)

@@ -149,8 +149,6 @@ def vehicle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
 
 def _jet_remarks(mission: Mission, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
     """Remark on the vehicle that another one's jet pushes down the most, as a share of its weight."""
-    models = mission.vehicle_models
-    assert models is not None
     worst = (0.0, 0.0, 0.0, 0, 0, 0.0, 0.0, "")
     for planned in way if mission.n_agents <= STACKED else ():
         flow = pair_jet_speeds(mission, planned.position)

@@ -54,7 +54,6 @@ def _judge_fault(sweep: Sweep, run: int) -> RunRecord:
 
 def _show_and_fault(sweep: Sweep, run: int) -> tuple[faults.Show, faults.GeometricFault]:
     """The show of a drill, and the geometric fault of a run."""
-    assert sweep.drill is not None
     show, (kind, size, count) = faults.show_of(sweep.mission.text, sweep.drill), sweep.values(run)
     who = faults.vehicles_of(sweep.seed, show.n, count, run // math.prod(sweep.grid_sizes.values()))
     return show, faults.GeometricFault(kind, size, who, faults.random_stream(sweep.seed, run, 2))
