@@ -6,14 +6,14 @@ from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, Strict
+from pydantic import Field
 
 from rigidfleet.math.geodesy import enu_of
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys
 from rigidfleet.mission.rules import Breach, Breaches, Draft
-from rigidfleet.mission.values import Coordinate, Flag, Part, key, required_key
+from rigidfleet.mission.values import Coordinate, Flag, Longitude, Part, Place, key, required_key
 from rigidfleet.solids.polygons import Region, edges_cross
 from rigidfleet.typing import Floats
 
@@ -26,15 +26,10 @@ _INSIDE, _SOME = 1e-6, 8
 #: Height up to which people reach [m].
 _TALL = 2.0
 
-_Degrees = Annotated[float, Strict(), Field(ge=-180, le=180)]
-_Ring = Annotated[
-    tuple[Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=2)], ...],
-    Field(min_length=3),
-]
-_Degree = Annotated[tuple[_Degrees, ...], Field(min_length=2, max_length=2)]
-_Polygon = Annotated[
-    tuple[Annotated[tuple[_Degree, ...], Field(min_length=3)], ...], Field(min_length=1)
-]
+_Ring = Annotated[tuple[Place, ...], Field(min_length=3)]
+_Degrees = Annotated[tuple[Longitude, ...], Field(min_length=2, max_length=2)]
+_RingInDegrees = Annotated[tuple[_Degrees, ...], Field(min_length=3)]
+_Polygon = Annotated[tuple[_RingInDegrees, ...], Field(min_length=1)]
 
 
 class Area(Part):
@@ -81,7 +76,6 @@ class Area(Part):
 
     def height_span(self, ground: float) -> tuple[float, float]:
         """Floor and ceiling [m]."""
-        del ground
         floor = -math.inf if self.floor is None else self.floor
         return floor, math.inf if self.ceiling is None else self.ceiling
 

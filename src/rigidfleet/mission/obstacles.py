@@ -186,9 +186,7 @@ class Heights(Solid):
     kind: Literal["heights"] = required_key(
         "everything between a surface of given heights and a base, over a rectangle"
     )
-    corner: Annotated[tuple[values.Coordinate, ...], Field(min_length=2, max_length=2)] = key(
-        "place [x, y] [m] of the first height", (0.0, 0.0)
-    )
+    corner: values.Place = key("place [x, y] [m] of the first height", (0.0, 0.0))
     spacing: values.Length = required_key("distance between neighbouring heights along x and y [m]")
     heights: tuple[tuple[values.Coordinate, ...], ...] | None = key(
         "heights [m]: a list for each x, in which y increases; each square between four heights is two "

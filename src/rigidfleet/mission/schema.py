@@ -36,9 +36,7 @@ class Start(Part):
         f"named shape: {', '.join(shapes.SHAPES)}", json_schema_extra={"enum": [*shapes.SHAPES]}
     )
     size: values.Size = required_key("edge length of the shape [m], or its three sizes")
-    count: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] = required_key(
-        "number of agents"
-    )
+    count: values.AgentNumber = required_key("number of agents")
     centre: values.Vector = key("centre of the shape [x, y, z] [m]", (0.0, 0.0, 0.0))
 
     def points(self) -> Floats:
@@ -401,7 +399,7 @@ class Formation(Part):
     dimension: Literal[2, 3] | None = key(
         "dimension of the space in which the agents keep this formation; default: that of the mission"
     )
-    agents: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] | None = key(
+    agents: values.AgentNumber | None = key(
         "number of vehicles in the shape, if the others rest; default: all"
     )
     rest: values.Rest | None = key(
@@ -477,7 +475,7 @@ class Limits(Part):
     vertical_jerk: values.Jerk | None = key(
         "maximum jerk of the reference up and down [m/s^3]; kept like `jerk`"
     )
-    tilt_deg: Annotated[float, Strict(), Field(gt=0, lt=90)] | None = key(
+    tilt_deg: values.Tilt | None = key(
         "maximum tilt of the thrust that the reference needs, from the vertical [deg]; kept by the plan of "
         "a smooth mission"
     )
@@ -556,9 +554,7 @@ class Noise(Part):
     velocity: values.Spread = key(
         "standard deviation of each component of the measured velocity [m/s]", 0.0
     )
-    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = key(
-        "measurements per second [Hz], at most 1000", 50.0
-    )
+    rate: values.Frequency = key("measurements per second [Hz], at most 1000", 50.0)
     delay: values.Delay = key(
         "age of a measurement when the laws use it [s]; only with [vehicles]", 0.0
     )
@@ -610,9 +606,7 @@ class Clocks(Part):
 class Network(Part):
     """How vehicles know each other: each computes its force from its own state and its neighbours' messages."""
 
-    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = key(
-        "broadcasts of each vehicle a second [Hz], at most 1000", 50.0
-    )
+    rate: values.Frequency = key("broadcasts of each vehicle a second [Hz], at most 1000", 50.0)
     delay: values.Delay = key("time from a broadcast to its arrival [s]", 0.0)
     jitter: values.Delay = key(
         "greatest time by which a message is later than that [s]: each is by a share of its own, so that "
@@ -783,9 +777,7 @@ class GeodeticOrigin(Part):
     latitude_deg: Annotated[float, Strict(), Field(gt=-90, lt=90)] = required_key(
         "latitude [deg], WGS 84"
     )
-    longitude_deg: Annotated[float, Strict(), Field(ge=-180, le=180)] = required_key(
-        "longitude [deg]"
-    )
+    longitude_deg: values.Longitude = required_key("longitude [deg]")
     altitude: Annotated[float, Strict(), Field(ge=-1000, le=20_000)] = key(
         "height of z = 0 above mean sea level [m]", 0.0
     )

@@ -81,10 +81,11 @@ _ValueOrWord = Annotated[
     Annotated[_T, Tag("one")] | Annotated[_Other, Tag("word")], Discriminator(_word_discriminator)
 ]
 _Two, _Three = (Field(min_length=n, max_length=n) for n in (2, 3))
+#: A place [x, y] as it is seen from above.
+Place = Annotated[tuple[Coordinate, ...], _Two]
 Vector = Annotated[tuple[Coordinate, ...], _Three]
-Velocity = Annotated[
-    tuple[Annotated[float, Strict(), signed_number_field(bounds.SPEED)], ...], _Three
-]
+_SignedSpeed = Annotated[float, Strict(), signed_number_field(bounds.SPEED)]
+Velocity = Annotated[tuple[_SignedSpeed, ...], _Three]
 #: A velocity, or "free": any.
 VelocityOrFree = _ValueOrWord[Velocity, Literal["free"]]
 Force = Annotated[tuple[Annotated[float, Strict(), signed_number_field(bounds.FORCE)], ...], _Three]
@@ -99,9 +100,8 @@ Edges = _OneOrList[
 #: Of each vehicle, pieces: duration, and coefficients of x, y, z and yaw.
 _Number = Annotated[float, Strict(), Field(ge=-1e12, le=1e12)]
 _Row = Annotated[tuple[_Number, ...], Field(min_length=5, max_length=33)]
-Trajectories = Annotated[
-    tuple[Annotated[tuple[_Row, ...], Field(min_length=1)], ...], Field(min_length=1)
-]
+_Trajectory = Annotated[tuple[_Row, ...], Field(min_length=1)]
+Trajectories = Annotated[tuple[_Trajectory, ...], Field(min_length=1)]
 
 #: Where vehicles without a slot wait.
 Rest = _OneOrList[Literal["sides"], tuple[Vector, ...]]
@@ -119,8 +119,10 @@ Small = Annotated[float, Strict(), Field(ge=1e-15, le=1.0)]
 Coefficient = Annotated[float, Strict(), Field(ge=0, le=1e3)]
 Scale = Annotated[float, Strict(), Field(ge=0.1, lt=1.0)]
 Share = Annotated[float, Strict(), Field(ge=0, le=0.95)]
+Frequency = Annotated[float, Strict(), Field(gt=0, le=1000)]
 Rate = Annotated[float, Strict(), Field(ge=1, le=100_000)]
 Tilt = Annotated[float, Strict(), Field(gt=0, lt=90)]
+Longitude = Annotated[float, Strict(), Field(ge=-180, le=180)]
 Inertia = Annotated[tuple[Annotated[float, Strict(), Field(ge=1e-9, le=1e6)], ...], _Three]
 BodyDrag = Annotated[tuple[Coefficient, ...], _Three]
 RotorSpeeds = Annotated[tuple[Annotated[float, Strict(), Field(ge=0, le=1e5)], ...], _Two]
@@ -128,15 +130,19 @@ MotorTimes = Annotated[tuple[Annotated[float, Strict(), Field(ge=1e-3, le=10)], 
 AttitudeGains = Annotated[tuple[Annotated[float, Strict(), Field(gt=0, le=1e6)], ...], _Two]
 #: A colour of light: red, green and blue in hexadecimal digits.
 Colour = _PerAgent[Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]]
-NAME_OR_LIST = WithJsonSchema(
-    {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]}
-)
+
+
+def _one_or_list(kind: dict[str, Any]) -> WithJsonSchema:
+    """In the schema: one value of a kind, or a list of them."""
+    return WithJsonSchema({"anyOf": [kind, {"type": "array", "items": kind}]})
+
+
+NAME_OR_LIST = _one_or_list({"type": "string"})
 
 
 def number_or_list(least: float) -> WithJsonSchema:
     """In the schema: a number of at least ``least``, or a list of them."""
-    number = {"type": "number", "minimum": least}
-    return WithJsonSchema({"anyOf": [number, {"type": "array", "items": number}]})
+    return _one_or_list({"type": "number", "minimum": least})
 
 
 def key(text: str, default: Any = None, **more: Any) -> Any:
