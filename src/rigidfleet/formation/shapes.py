@@ -30,9 +30,7 @@ def _triangle(size: Floats, n: int) -> Floats:
 
 
 def _polygon(size: Floats, n: int) -> Floats:
-    angle = 2 * np.pi * np.arange(n) / n
-    radius = size[0] / (2 * np.sin(np.pi / n))
-    return radius * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    return _rings((n, size[0] / (2 * np.sin(np.pi / n)), 0, 0))
 
 
 def _cuboid(size: Floats, n: int) -> Floats:

@@ -27,14 +27,14 @@ from rigidfleet.typing import Floats, Ints
 #: is linear in the speed. Identified from flights: 0.4 to 0.5 /s along two axes of a quadrotor (Faessler, Franchi,
 #: Scaramuzza, Robotics and Automation Letters 3, 2018). A vehicle with more mass per rotor has less.
 DRAG = 0.3
+_SHAPE = f"named shape: {', '.join(shapes.SHAPES)}"
+_SHAPE_NAMES: dict[str, Any] = {"enum": [*shapes.SHAPES]}
 
 
 class Start(Part):
     """Start positions of the agents on the slots of a named shape, in their order."""
 
-    shape: str = required_key(
-        f"named shape: {', '.join(shapes.SHAPES)}", json_schema_extra={"enum": [*shapes.SHAPES]}
-    )
+    shape: str = required_key(_SHAPE, json_schema_extra=_SHAPE_NAMES)
     size: values.Size = required_key("edge length of the shape [m], or its three sizes")
     count: values.AgentNumber = required_key("number of agents")
     centre: values.Vector = key("centre of the shape [x, y, z] [m]", (0.0, 0.0, 0.0))
@@ -373,10 +373,7 @@ class Formation(Part):
     The methods require a checked formation of `n` agents.
     """
 
-    shape: str | None = key(
-        f"named shape: {', '.join(shapes.SHAPES)}",
-        json_schema_extra={"enum": [*shapes.SHAPES]},
-    )
+    shape: str | None = key(_SHAPE, json_schema_extra=_SHAPE_NAMES)
     size: values.Size | None = key("edge length of the shape [m]; for a cuboid also [x, y, z]")
     slots: tuple[values.Vector, ...] | None = key(
         "instead of a shape: desired position of each agent in the body frame [m], or the name of a "

@@ -86,11 +86,6 @@ def off_plan(result: Result) -> OffPlan | None:
     return OffPlan(np.where(result.left, off, np.nan), doubt, limit)
 
 
-def vehicle_names_in_log(result: Result) -> list[str]:
-    """Names of the vehicles of a log, as their files have them."""
-    return [st.clean_name(x) for x in result.statistics["names"]]
-
-
 @st.styled_figure(lambda result: "bands" in result.statistics, "no log against a plan")
 def plan_and_flight(result: Result) -> Figure:
     """The plan (dashed) and the flight from above, and how far vehicles are from their slots, with what is in doubt."""
@@ -101,7 +96,7 @@ def plan_and_flight(result: Result) -> Figure:
     assert off is not None  # there are bands
     n, time, slots = result.n_agents, result.time, result.slot_position
     st.draw_time_axis(below, result)
-    colours, names = st.agent_colours(n), vehicle_names_in_log(result)
+    colours, names = st.agent_colours(n), [st.clean_name(x) for x in result.statistics["names"]]
     # Of many vehicles, those that are off the most.
     shown = np.sort(np.argsort(-np.fmax.reduce(off.far, axis=0))[:_SHOWN]).tolist()
     low, high = 1e3 * off.distance_interval

@@ -15,14 +15,14 @@ import re
 import sys
 from functools import cached_property
 from statistics import NormalDist
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, Strict
 
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.mission.findings import suggest
-from rigidfleet.mission.values import Number, Part, Positive, key, required_key
+from rigidfleet.mission.values import Number, Part, Positive, key, models_by_kind, required_key
 
 #: Signs in a line, and the change that each stands for; what each change makes of a number and a value.
 _SIGNS = {"=": "set", "+=": "add", "*=": "scale"}
@@ -217,11 +217,9 @@ class Geomspace(_Spaced):
         return tuple(np.geomspace(self.low, self.high, self.count).tolist())
 
 
+_Kind = Normal | Uniform | LogUniform | Choice | Grid | Linspace | Geomspace
 #: Models of variations by `kind`.
-KINDS: dict[str, type[Variation]] = {
-    get_args(model.model_fields["kind"].annotation)[0]: model
-    for model in (Normal, Uniform, LogUniform, Choice, Grid, Linspace, Geomspace)
-}
+KINDS: dict[str, type[Variation]] = models_by_kind(Annotated[_Kind, Field(discriminator="kind")])
 #: Keys that stand elsewhere in a line than in the brackets.
 _SHARED = {*Gridded.model_fields, "kind"}
 _LINE = re.compile(r"\s*(.+?)\s*(\+=|\*=|=)\s*([\w-]+)\s*\((.*)\)\s*", re.DOTALL)
