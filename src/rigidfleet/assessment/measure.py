@@ -124,13 +124,24 @@ class Measurements:
         every: list[dict[str, Extreme]] = [{} for _ in self.parts]
         for q in (q for q in QUANTITIES.values() if q.by_phase):
             sampled, alone = self.samples_of(q.name), q.name not in self.names_recorded
-            for phase, part, worst in zip(self.result.phases, self.parts, every, strict=True):
-                x, e = phase.extremes.get(q.name), self.worst_sample(sampled, part, alone=alone)
-                if x is not None and (e is None or q.rank(e.value) < q.rank(_in_unit(q, x))):
+            ranks = self.worst_ranks(q.name)
+            for phase, part, rank, worst in zip(self.result.phases, self.parts, ranks, every, strict=True):
+                x, e = phase.extremes.get(q.name), None
+                if x is not None and (rank == -math.inf or rank < q.rank(_in_unit(q, x))):
                     e = self.extreme_of(q.name, x, phase.name)
+                elif rank > -math.inf:
+                    e = self.worst_sample(sampled, part, alone=alone)
                 if e is not None:
                     worst[q.name] = e
         return every
+
+    def worst_ranks(self, name: str) -> list[float]:
+        """Rank of the worst sample of a quantity in each phase; -infinity if none is finite."""
+        rank, worst = self.samples_of(name).rank, np.full(len(self.parts), -np.inf)
+        if rank.size:
+            starts = [self.parts[k].start * rank.shape[1] for k in self.flown]
+            worst[self.flown] = np.maximum.reduceat(rank.reshape(-1), starts)
+        return worst.tolist()
 
     def first_contact(self, name: str, e: Extreme) -> Extreme | None:
         """The first contact of agents ("separation") or with an obstacle ("clearance"), of which e is the worst."""
@@ -205,6 +216,7 @@ class Measurements:
                     f"its {name} is up to {value(worst, unit)} off the value from its own samples"
                 )
                 yield words, float(time[k])
+        ranks = {name: self.worst_ranks(name) for name in _SLACK}
         for index, phase in enumerate(result.phases):
             part, extremes = self.parts[index], phase.extremes
             if part.stop > part.start and extremes:
@@ -213,14 +225,15 @@ class Measurements:
                     words = f"it lacks the worst '{name}' of phase '{phase.name}' between samples"
                     yield words, float(time[part.start])
             for name, share in _SLACK.items():
-                x, e = extremes.get(name), self.worst_sample(self.samples_of(name), part)
-                if x is None or e is None:
+                x, rank = extremes.get(name), ranks[name][index]
+                if x is None or rank == -math.inf:
                     continue
-                rank, recorded = map(quantity(name).rank, (e.value, x.value))
                 slack = rounding + share * abs(rank)
-                if rank > recorded + slack or not (
+                if rank > quantity(name).rank(x.value) + slack or not (
                     phase.t_start - 1e-9 <= x.time <= phase.t_end + 1e-9
                 ):
+                    e = self.worst_sample(self.samples_of(name), part)
+                    assert e is not None
                     words = (
                         f"its worst {name.replace('_', ' ')} of phase '{phase.name}' is given as"
                     )
@@ -234,7 +247,7 @@ class Measurements:
         if name == "geofence":
             return self.mission.limits.geofence is not None
         if name != "clearance":
-            return self.worst_sample(self.samples_of(name), self.parts[index]) is not None
+            return self.worst_ranks(name)[index] > -math.inf
         # An obstacle that is there at the start or the end of a phase alone is not in it.
         phase = self.result.phases[index]
         there = (thing.solid.there[0] for thing in self.mission.obstacles)
@@ -248,7 +261,7 @@ class Measurements:
             **{key: getattr(record, key) for key in _OF_RECORD},
             finished=finished and not record.abandoned,
             constraint=_greatest_size(result.constraint[self.parts[index]][-1:]),
-            distances=self.shape_error_at_end(index),
+            distances=self.shape_errors_at_end.get(index),
             shape=None if fit is None else fit.error,
             handedness=None if fit is None or fit.dimension < 3 else not fit.is_mirrored,
             flip=self.axis_errors_at_end.get(index),
@@ -274,50 +287,56 @@ class Measurements:
         kept &= mission.has_link(edges, float(self.result.time[k]))
         return edges[kept], intended[kept]
 
-    def shape_error_at_end(self, index: int) -> float | None:
-        """Greatest error [m] of an edge against the formation at the end of a phase, if it has one."""
-        name = self.result.phases[index].formation
-        if name is None or index not in self.flown:
-            return None
-        k = self.parts[index].stop - 1
-        edges, intended = self.edges_at_sample(name, k)
-        off = proximity.pair_distances(self.result.position[[k]], edges)[:, 0] - intended
-        return _greatest_size(off)
+    @cached_property
+    def _ends_alike(self) -> list[tuple[str, list[int], list[int]]]:
+        """Phases that end in one formation of the same vehicles and links: its name, the phases, their last samples."""
+        alike: dict[tuple[object, ...], tuple[list[int], list[int]]] = {}
+        for index, k in zip(self.flown, self.last, strict=True):
+            if (name := self.result.phases[index].formation) is not None:
+                lost = np.count_nonzero(self.mission.links_lost[1] < self.result.time[k])
+                indices, last = alike.setdefault((name, self.left[k].tobytes(), lost), ([], []))
+                indices.append(index)
+                last.append(k)
+        return [(str(key[0]), *phases) for key, phases in alike.items()]
+
+    @cached_property
+    def shape_errors_at_end(self) -> dict[int, float | None]:
+        """Greatest error [m] of an edge against the formation at the end of each phase that has one."""
+        errors: dict[int, float | None] = {}
+        for name, indices, last in self._ends_alike:
+            edges, intended = self.edges_at_sample(name, last[0])
+            off = proximity.pair_distances(self.result.position[last], edges).T - intended
+            errors.update(zip(indices, map(_greatest_size, off), strict=True))
+        return errors
 
     @cached_property
     def fits_at_end(self) -> dict[int, Fit]:
-        """Fits of the formations at the end of each phase that has one; those of one formation at once."""
-        result, mission, fits = self.result, self.mission, {}
-        alike: dict[tuple[str, bytes], list[tuple[int, int]]] = {}
-        for index, k in zip(self.flown, self.last, strict=True):
-            name = result.phases[index].formation
-            if name is not None and np.isfinite(result.position[k]).all():
-                alike.setdefault((name, self.left[k].tobytes()), []).append((index, k))
-        for (name, _), phases in alike.items():
-            left, slots = np.flatnonzero(self.left[phases[0][1]]), mission.formation_slots(name)
-            if slots is not None and len(left) > 1:
+        """Fits of the formations at the end of each phase that has one."""
+        mission, fits = self.mission, {}
+        for name, indices, last in self._ends_alike:
+            left, slots = np.flatnonzero(self.left[last[0]]), mission.formation_slots(name)
+            p = self.result.position[last]
+            known = np.flatnonzero(np.isfinite(p).all(axis=(1, 2))).tolist()
+            if slots is not None and len(left) > 1 and known:
                 most = mission.formations[name].greatest_error
-                indices, last = map(list, zip(*phases, strict=True))
-                each = fits_by_sample(result.position[last][:, left], slots[left], left, most)
-                fits.update(zip(indices, each, strict=True))
+                each = fits_by_sample(p[known][:, left], slots[left], left, most)
+                fits.update(zip([indices[k] for k in known], each, strict=True))
         return fits
 
     @cached_property
     def axis_errors_at_end(self) -> dict[int, float | None]:
         """Angle [deg] of a line or plane from its intended direction at the end of each phase that has one."""
         flips, result = {}, self.result
+        # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
+        q = np.array([x[self.last] for x in (result.attitude_reference, result.frame)])
+        turns = dict(zip(self.flown, att.dcm_from_quaternion(q).swapaxes(0, 1), strict=True))
         for index, fit in self.fits_at_end.items():
             if fit.dimension == 3:
                 continue
             # Only tracked slots steer a line; otherwise its direction follows from the shape before.
             steers = 2 if fit.dimension == 2 else result.phases[index].control == "tracking"
-            k = self.parts[index].stop - 1
-            # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
-            aims = (
-                fit.axis @ att.dcm_from_quaternion(q[k])
-                for q in (result.attitude_reference, result.frame)[:steers]
-            )
-            angles = (degrees_between(fit.turned_axis, aim.tolist()) for aim in aims)
+            aims = (fit.axis @ turns[index][:steers]).tolist()
+            angles = (degrees_between(fit.turned_axis, aim) for aim in aims)
             flips[index] = next(filter(math.isfinite, angles), None)
         return flips
 

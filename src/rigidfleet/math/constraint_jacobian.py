@@ -18,16 +18,21 @@ def jacobian(points: ArrayLike, edges: ArrayLike) -> Floats:
     """
     p = np.asarray(points, dtype=np.float64)
     i, j = np.asarray(edges, dtype=np.int64).reshape(-1, 2).T
-    u = p[..., i, :] - p[..., j, :]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u /= np.linalg.norm(u, axis=-1, keepdims=True)
-    row = np.arange(len(i))
+    u, row = _unit_vectors(p, i, j), np.arange(len(i))
     # Agents of an edge first, samples last, so that an assignment is one pass.
     J = np.zeros((len(i), p.shape[-2], *p.shape[:-2], p.shape[-1]))
     J[row, i] = np.moveaxis(u, -2, 0)
     J[row, j] = -J[row, i]
     J = np.moveaxis(J, (0, 1), (-3, -2))
     return J.reshape(*p.shape[:-2], len(i), p.shape[-2] * p.shape[-1])
+
+
+def _unit_vectors(p: Floats, i: Ints, j: Ints) -> Floats:
+    """u_ij (..., m, d) from agents j (m,) to i (m,) at p (..., N, d), not finite where they are at the same place."""
+    u = p.take(i, axis=-2) - p.take(j, axis=-2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u /= np.sqrt(np.add.reduce(u * u, axis=-1, keepdims=True))
+    return u
 
 
 def filter_factors(
@@ -76,7 +81,12 @@ def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = N
     if len(r) > some:
         parts = [r[k : k + some] for k in range(0, len(r), some)]
         return np.concatenate([smallest_singular_value(part, edges, masses) for part in parts])
-    return least_singular(jacobian(r, edges), masses)
+    if masses is not None or len(edges) > 3 * r.shape[1]:
+        return least_singular(jacobian(r, edges), masses)
+    # J J^T without J: u_ij^T u_kl, by the agents that two edges share.
+    u, ends = _unit_vectors(r, *np.transpose(edges)), np.eye(r.shape[1])[edges]
+    incidence = ends[:, 0] - ends[:, 1]
+    return _root_of_least_eigenvalue((u @ u.swapaxes(1, 2)) * (incidence @ incidence.T))
 
 
 def least_singular(J: Floats, masses: ArrayLike | None = None) -> Floats:
@@ -86,7 +96,11 @@ def least_singular(J: Floats, masses: ArrayLike | None = None) -> Floats:
         J = J * np.repeat(np.sqrt(m.mean() / m), 3)
     # The smaller Gram matrix takes a third of the time of a decomposition of J itself.
     turned = J.swapaxes(1, 2)
-    gram = J @ turned if J.shape[1] <= J.shape[2] else turned @ J
+    return _root_of_least_eigenvalue(J @ turned if J.shape[1] <= J.shape[2] else turned @ J)
+
+
+def _root_of_least_eigenvalue(gram: Floats) -> Floats:
+    """Roots (K,) of the smallest non-zero eigenvalues of matrices (K, s, s), NaN of those that are not finite."""
     known = np.isfinite(gram).all(axis=(1, 2))
     gram[~known] = 0.0
     w = np.linalg.eigvalsh(gram)
