@@ -129,7 +129,7 @@ def gust_and_noise_tables(disturbances: Sequence[Disturbance]) -> dict[str, Any]
 
 def packed(parts: Sequence[Floats]) -> LaneArray:
     """Lanes (...) of eight arrays of one shape (...)."""
-    return simd.pack_lanes(np.stack(parts, axis=-1))
+    return simd.pack_lanes(np.moveaxis(np.array(parts), 0, -1))
 
 
 def addresses(arrays: Sequence[Floats]) -> Ints:
