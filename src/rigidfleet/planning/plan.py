@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.arrays import arrays_equal
 from rigidfleet.errors import StoppedError
 from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.kernel.problem import (
@@ -242,7 +243,10 @@ def plan_phase(
         d1 = now.reference.values_of(edges, d1)
     reference = leg.reference
     if shaping is not None or now.blend is None:
-        d0 = now.reference.values_of(edges, distance_geometry.distances(now.r, edges))
+        known = now.reference
+        d0 = known.values
+        if not arrays_equal(edges, known.edges):
+            d0 = known.values_of(edges, distance_geometry.distances(now.r, edges))
         # Distances are those of the slots where these have the lengths commanded.
         agree = shaping is None and phase.control == "tracking" and _agree(d1, reference.p0, edges)
         reference = reference._replace(kind=SHAPE if agree else reference.kind, d0=d0, d1=d1)
