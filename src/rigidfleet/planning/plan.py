@@ -243,10 +243,9 @@ def plan_phase(
         d1 = now.reference.values_of(edges, d1)
     reference = leg.reference
     if shaping is not None or now.blend is None:
-        known = now.reference
-        d0 = known.values
-        if not arrays_equal(edges, known.edges):
-            d0 = known.values_of(edges, distance_geometry.distances(now.r, edges))
+        d0 = now.reference.values
+        if not arrays_equal(edges, now.reference.edges):
+            d0 = now.reference.values_of(edges, distance_geometry.distances(now.r, edges))
         # Distances are those of the slots where these have the lengths commanded.
         agree = shaping is None and phase.control == "tracking" and _agree(d1, reference.p0, edges)
         reference = reference._replace(kind=SHAPE if agree else reference.kind, d0=d0, d1=d1)
@@ -331,11 +330,10 @@ def _name_if_in_formation(mission: Mission, name: str | None, now: PhaseState) -
     slots = mission.formation_slots(name) if name else None
     if slots is None:
         return None
-    slots, r = slots[~now.lost], now.r[~now.lost]
-    if len(slots) < 2:
+    both = np.array([slots, now.r])[:, ~now.lost]
+    if both.shape[1] < 2:
         return None
-    pairs = graphs.complete_graph(len(slots))
-    wanted, lengths = (distance_geometry.distances(x, pairs) for x in (slots, r))
+    wanted, lengths = distance_geometry.distances(both, graphs.complete_graph(both.shape[1]))
     return name if (np.abs(lengths - wanted) <= _NEAR * wanted.min()).all() else None
 
 
