@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.arrays import arrays_equal
 from rigidfleet.errors import StoppedError
 from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.kernel.problem import (
@@ -243,9 +242,7 @@ def plan_phase(
         d1 = now.reference.values_of(edges, d1)
     reference = leg.reference
     if shaping is not None or now.blend is None:
-        d0 = now.reference.values
-        if not arrays_equal(edges, now.reference.edges):
-            d0 = now.reference.values_of(edges, distance_geometry.distances(now.r, edges))
+        d0 = now.reference.values_of(edges, distance_geometry.distances(now.r, edges))
         # Distances are those of the slots where these have the lengths commanded.
         agree = shaping is None and phase.control == "tracking" and _agree(d1, reference.p0, edges)
         reference = reference._replace(kind=SHAPE if agree else reference.kind, d0=d0, d1=d1)
