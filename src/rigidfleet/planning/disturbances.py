@@ -14,6 +14,7 @@ from rigidfleet.kernel.problem import Disturbance, Problem, graph, no_disturbanc
 from rigidfleet.math import turbulence
 from rigidfleet.mission import Gusts, Mission
 from rigidfleet.mission.disturbances import gust_intensity, knot_spacing
+from rigidfleet.mission.model import part_of_mission
 from rigidfleet.planning import filters
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -23,6 +24,14 @@ NOTHING = 1e-20
 
 def mission_disturbance(mission: Mission) -> Disturbance:
     """Disturbances of a mission from its start to its latest end, with no vehicle lost yet."""
+    out = part_of_mission(mission, _disturbance_without_ground)
+    if not out.active:
+        return out
+    return out._replace(floor=mission.ground + mission.fleet.radius, roofs=mission.roofs)
+
+
+def _disturbance_without_ground(mission: Mission) -> Disturbance:
+    """What does not depend on obstacles, which may be replaced in flight: random numbers take long to draw."""
     d = mission.disturbances
     none = no_disturbance(mission.fleet.mass.copy())
     if d is None:
@@ -34,9 +43,7 @@ def mission_disturbance(mission: Mission) -> Disturbance:
         inverse=1.0 / mission.true_mass,
         drag=mission.drag,
         wind=wind,
-        floor=mission.ground + mission.fleet.radius,
         radius=mission.fleet.radius,
-        roofs=mission.roofs,
     )
     if d.gusts is not None:
         step = knot_spacing(d.gusts, float(np.linalg.norm(wind)))

@@ -327,11 +327,10 @@ def _name_if_in_formation(mission: Mission, name: str | None, now: PhaseState) -
     slots = mission.formation_slots(name) if name else None
     if slots is None:
         return None
-    slots, r = slots[~now.lost], now.r[~now.lost]
-    if len(slots) < 2:
+    both = np.array([slots, now.r])[:, ~now.lost]
+    if both.shape[1] < 2:
         return None
-    pairs = graphs.complete_graph(len(slots))
-    wanted, lengths = (distance_geometry.distances(x, pairs) for x in (slots, r))
+    wanted, lengths = distance_geometry.distances(both, graphs.complete_graph(both.shape[1]))
     return name if (np.abs(lengths - wanted) <= _NEAR * wanted.min()).all() else None
 
 

@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
+from rigidfleet._common.arrays import arrays_equal
 from rigidfleet.formation import distance_geometry
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import attitude as att
@@ -29,7 +30,7 @@ class ByEdge:
 
     def values_of(self, edges: Ints, other: Floats | float) -> Floats:
         """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges, or (B, m), then of so many flights."""
-        if np.array_equal(edges, self.edges):  # most phases have those of the phase before
+        if arrays_equal(edges, self.edges):  # most phases have those of the phase before
             return np.where(True, self.values, other)
         keys, own = _edge_codes(edges), _edge_codes(self.edges)
         order = np.argsort(own)
@@ -39,7 +40,7 @@ class ByEdge:
 
     def with_values(self, edges: Ints, values: Floats) -> ByEdge:
         """These values, updated with the ``values`` of edges (m, 2), i < j."""
-        if np.array_equal(edges, self.edges):
+        if arrays_equal(edges, self.edges):
             return ByEdge(self.edges, values.copy())
         edges = np.concatenate([edges, self.edges])
         first = np.unique(_edge_codes(edges), return_index=True)[1]

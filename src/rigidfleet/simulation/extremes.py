@@ -172,12 +172,12 @@ class CurveWatch:
                 self._watch_step(problem, work, state, *part)
             return
         self.monitor.search_distances(problem, state, first, steps)
-        self._find_contacts(problem, work, state, np.arange(first, steps))
+        self._find_contacts(problem, work, state, range(first, steps))
 
     def _find_contacts(
-        self, problem: Problem, work: Workspace, state: records.IntegratorState, step_indices: Ints
+        self, problem: Problem, work: Workspace, state: records.IntegratorState, step_indices: range
     ) -> None:
-        """Find the first contact of each kind in some steps (S,) of the trail, if there has been none before.
+        """Find the first contact of each kind in some steps of the trail, if there has been none before.
 
         Of steps, and then of one step's halves, the first half is searched, until what is left is very short.
         """
@@ -308,7 +308,7 @@ class CurveWatch:
                 return
         self.moved += moved
         self.monitor.search_distances(problem, alone, 0, 1)
-        self._find_contacts(problem, work, alone, np.zeros(1, dtype=np.int64))
+        self._find_contacts(problem, work, alone, range(1))
 
     def _list_near_pairs(self, problem: Problem, y: Floats, moves: float) -> None:
         """List the pairs that are near each other, or one below the other, at a state (n,).

@@ -129,7 +129,9 @@ def gust_and_noise_tables(disturbances: Sequence[Disturbance]) -> dict[str, Any]
 
 def packed(parts: Sequence[Floats]) -> LaneArray:
     """Lanes (...) of eight arrays of one shape (...)."""
-    return simd.pack_lanes(np.stack(parts, axis=-1))
+    lanes = simd.empty_lanes(parts[0].shape)
+    np.stack(parts, axis=-1, out=unpack_lanes(lanes))
+    return lanes
 
 
 def addresses(arrays: Sequence[Floats]) -> Ints:

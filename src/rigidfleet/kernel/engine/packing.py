@@ -68,13 +68,13 @@ def _kinds_and_words(x: Any) -> tuple[Any, list[Any], list[Any]]:
     for value in x:
         if isinstance(value, np.ndarray):
             try:
-                address = ctypes.addressof(_buffer(value))
+                words.append(ctypes.addressof(_buffer(value)))
             except TypeError:  # it is read-only, or not contiguous
                 if not value.flags.c_contiguous:
                     raise TypeError("the kernel takes only C-contiguous arrays") from None
-                address = value.__array_interface__["data"][0]
-            words += (address, *value.shape)
-            kinds.append((value.dtype.char, value.ndim))
+                words.append(value.__array_interface__["data"][0])
+            words += value.shape
+            kinds += value.dtype.char, value.ndim
         elif isinstance(value, float):
             words.append(value)
             kinds.append(float)
