@@ -141,29 +141,25 @@ def bernstein_column_value(basis, points, q):
 
 
 @jit
-def world_control_points(points, i, derivative, p, monitor, out):
-    """Control points (5, 3) of agent i's position in the world, or of its velocity (``derivative`` 1)."""
+def write_world_control_points(points, part, parts, p, monitor):
+    """Write control points (5, 6N) of positions and velocities in the world over a piece of a step in body axes."""
+    write_body_frames(points, part, parts, p, monitor)
+    at_knots, in_body, out = monitor.knots, monitor.scratch[1], monitor.world
     n = p.vehicles.m.shape[0]
-    first = 3 * i + 3 * n * derivative
-    if not p.body_formulation:
+    for i in range(2 * n):  # positions, then velocities
+        for k in range(5):
+            T = monitor.attitudes[k]
+            for q in range(3):
+                in_body[q] = bernstein_column_value(monitor.basis[k], points, 3 * i + q)
+            for q in range(3):
+                at_knots[k, q] = monitor.centres[k, 3 * (i // n) + q]
+                for s in range(3):
+                    at_knots[k, q] += T[s, q] * in_body[s]
         for k in range(5):
             for q in range(3):
-                out[k, q] = points[k, first + q]
-        return
-    at_knots, in_body = monitor.knots, monitor.scratch[1]
-    for k in range(5):
-        T = monitor.attitudes[k]
-        for q in range(3):
-            in_body[q] = bernstein_column_value(monitor.basis[k], points, first + q)
-        for q in range(3):
-            at_knots[k, q] = monitor.centres[k, 3 * derivative + q]
-            for s in range(3):
-                at_knots[k, q] += T[s, q] * in_body[s]
-    for k in range(5):
-        for q in range(3):
-            out[k, q] = 0.0
-            for j in range(5):
-                out[k, q] += FROM_KNOTS[k, j] * at_knots[j, q]
+                out[k, 3 * i + q] = 0.0
+                for j in range(5):
+                    out[k, 3 * i + q] += FROM_KNOTS[k, j] * at_knots[j, q]
 
 
 # -- distances ---------------------------------------------------------------------------------------
@@ -267,16 +263,16 @@ def bound_distance_changes(p, state, monitor):
 
 
 @jit
-def enclose_points(curve, ball):
-    """Write into a ball (4,) the middle one of control points (5, 3), and the least radius [m] that holds all."""
-    ball[0], ball[1], ball[2], ball[3] = curve[2, 0], curve[2, 1], curve[2, 2], ball_radius(curve)
-
-
-@jit
 def enclose_agents(points, monitor):
-    """Balls that hold the agents' positions over a step, in the axes of the states."""
+    """Balls about the agents' middle control points that hold their positions over a step."""
     for i in range(monitor.balls.shape[0]):
-        enclose_points(points[:, 3 * i : 3 * i + 3], monitor.balls[i])
+        curve, ball = points[:, 3 * i : 3 * i + 3], monitor.balls[i]
+        ball[0], ball[1], ball[2], ball[3] = (
+            curve[2, 0],
+            curve[2, 1],
+            curve[2, 2],
+            ball_radius(curve),
+        )
 
 
 @jit
@@ -297,11 +293,11 @@ def surely_apart(i, j, n_axes, reach, monitor):
 def watch_pairs(kind, pairs, points, t, h, monitor):
     """Least distance, or height, between the surfaces of pairs of agents (P, 2) over a step.
 
-    Distances, which no axes change, are those of the step's control points (5, n); heights, and distances while one
-    of the two is at the altitude that counts, are those of curves in world axes.
+    Distances may be those in any axes; heights, and distances while one of the two is at the altitude that counts,
+    are those of control points (5, n) in world axes.
     """
     below, flying = kind == SEPARATION_BELOW, kind == SEPARATION_FLYING
-    axes, curve = 2 if below else 3, monitor.curve
+    axes, pieces = 2 if below else 3, monitor.pieces
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
         # Surfaces that overlap count by how deep, so that the floor may be below the sum of the radii.
@@ -309,19 +305,16 @@ def watch_pairs(kind, pairs, points, t, h, monitor):
         floor = monitor.worst[kind] + radii
         if surely_apart(i, j, axes, radii if below else floor, monitor):
             continue
-        own, other = monitor.places[i], monitor.places[j]
+        own, other = points[:, 3 * i : 3 * i + 3], points[:, 3 * j : 3 * j + 3]
         for s in range(5):
             for q in range(3):
-                if below or flying:
-                    curve[s, q] = own[s, q] - other[s, q]
-                else:
-                    curve[s, q] = points[s, 3 * i + q] - points[s, 3 * j + q]
+                pieces[0, 3 * s + q] = own[s, q] - other[s, q]
         if below:
-            value, at = least_height_in_cylinder(curve, radii, floor, monitor.pieces)
+            value, at = least_height_in_cylinder(radii, floor, pieces)
         elif flying:
-            value, at = least_norm_above(curve, own, other, monitor.altitude, floor, monitor.pieces)
+            value, at = least_norm_above(own, other, monitor.altitude, floor, pieces)
         else:
-            value, at = least_norm_of_curve(curve, floor, monitor.work, monitor.pieces)
+            value, at = least_norm_of_curve(floor, monitor.work, pieces)
         if at >= 0.0:
             store_if_worse(kind, value - radii, t + at * h, i, j, monitor)
 
@@ -331,9 +324,10 @@ def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
     """Least of sign r[axis] - offset over a curve (5, 3)."""
     work, bound = monitor.work, math.inf
     for k in range(5):
-        work[0, k] = sign * curve[k, axis] - offset
-        bound = min(bound, work[0, k])
+        bound = min(bound, sign * curve[k, axis] - offset)
     if bound < monitor.worst[kind] - CLOSE:
+        for k in range(5):
+            work[0, k] = sign * curve[k, axis] - offset
         value, at = least_polynomial_value(work, 4, monitor.worst[kind])
         if at >= 0.0:
             store_if_worse(kind, value, t + at * h, i, -1, monitor)
@@ -345,13 +339,15 @@ def watch_speed(kind, curve, low, high, t, h, i, monitor):
     fastest, piece = 0.0, monitor.pieces[0]
     for k in range(5):
         size = 0.0
-        for q in range(3):
-            piece[3 * k + q] = curve[k, q] if low <= q < high else 0.0
-            size += piece[3 * k + q] ** 2
+        for q in range(low, high):
+            size += curve[k, q] ** 2
         fastest = max(fastest, size)
     greatest = -monitor.worst[kind]  # -inf at first
     if fastest <= greatest * abs(greatest):
         return
+    for k in range(5):
+        for q in range(3):
+            piece[3 * k + q] = curve[k, q] if low <= q < high else 0.0
     squared_norm_coefficients(piece, -1.0, monitor.work[0])
     _, at = least_polynomial_value(monitor.work, 8, -greatest * abs(greatest))
     if at >= 0.0:
@@ -402,9 +398,9 @@ def watch_obstacles(i, curve, t, h, last, monitor):
     """
     radius, standing = monitor.radius[i], monitor.standing[i] != 0
     x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], monitor.balls[i, 3]
+    floor = clearance_to_beat(i, monitor) + radius
     for b in range(monitor.boxes.shape[0]):
         box = monitor.boxes[b]
-        floor = clearance_to_beat(i, monitor) + radius
         far = max(0.0, box[0] - x, x - box[3]) ** 2 + max(0.0, box[1] - y, y - box[4]) ** 2
         far += max(0.0, box[2] - z, z - box[5]) ** 2
         if far >= (floor + span) ** 2 and floor + span > 0.0:  # far from the whole obstacle
@@ -414,6 +410,7 @@ def watch_obstacles(i, curve, t, h, last, monitor):
             x_near, y_near, z_near = point_at(curve, at)
             _, _, up = box_normal(x_near, y_near, z_near, box)
             store_clearance(value - radius, t + at * h, i, b, up >= STEEP, monitor)
+            floor = clearance_to_beat(i, monitor) + radius
     if not last or not (standing or monitor.low[i, 0] < math.inf):
         return
     for b in range(monitor.boxes.shape[0]):
@@ -433,7 +430,7 @@ def watch_trail_distances(first, end, p, state, monitor):
 @jit
 def watch_step_distances(step, p, state, monitor):
     """Take the extremes of distances and speeds over one step of the trail."""
-    trail, row = state.trail, trail_row_of(step, state)
+    trail, row, n = state.trail, trail_row_of(step, state), monitor.left.shape[0]
     points, t, h = trail.points[row], trail.clock[row, 0], trail.clock[row, 1]
     enclose_agents(points, monitor)
     watch_pairs(SEPARATION, monitor.pairs, points, t, h, monitor)
@@ -443,20 +440,19 @@ def watch_step_distances(step, p, state, monitor):
     h /= parts
     for part in range(parts):
         start = t + part * h
+        world = monitor.world if p.body_formulation else points
         if p.body_formulation:
-            write_body_frames(points, part, parts, p, monitor)
-        for i in range(monitor.left.shape[0]):
+            write_world_control_points(points, part, parts, p, monitor)
+            enclose_agents(world, monitor)
+        for i in range(n):
             if not monitor.left[i]:
                 continue
-            curve = monitor.curve
-            world_control_points(points, i, 1, p, monitor, curve)
+            curve = world[:, 3 * (n + i) : 3 * (n + i) + 3]
             watch_speed(SPEED, curve, 0, 3, start, h, i, monitor)
             if monitor.worst[HORIZONTAL_SPEED] > -math.inf:
                 watch_speed(HORIZONTAL_SPEED, curve, 0, 2, start, h, i, monitor)
                 watch_speed(VERTICAL_SPEED, curve, 2, 3, start, h, i, monitor)
-            curve = monitor.places[i]
-            world_control_points(points, i, 0, p, monitor, curve)
-            enclose_points(curve, monitor.balls[i])
+            curve = world[:, 3 * i : 3 * i + 3]
             watch_coordinate(LOWEST, curve, 2, 1.0, 0.0, start, h, i, monitor)
             watch_coordinate(HIGHEST, curve, 2, -1.0, 0.0, start, h, i, monitor)
             for f in range(monitor.fence.shape[0]):
@@ -466,9 +462,9 @@ def watch_step_distances(step, p, state, monitor):
                     watch_coordinate(GEOFENCE, curve, q, -1.0, -high, start, h, i, monitor)
             if monitor.boxes.shape[0] > 0:
                 watch_obstacles(i, curve, start, h, part == parts - 1, monitor)
-        watch_pairs(SEPARATION_BELOW, monitor.columns, points, start, h, monitor)
+        watch_pairs(SEPARATION_BELOW, monitor.columns, world, start, h, monitor)
         if monitor.altitude < math.inf:
-            watch_pairs(SEPARATION_FLYING, monitor.pairs, points, start, h, monitor)
+            watch_pairs(SEPARATION_FLYING, monitor.pairs, world, start, h, monitor)
 
 
 # -- forces ------------------------------------------------------------------------------------------
