@@ -9,12 +9,12 @@ are exact to 1e-9 of the formation's size.
 
 Forces are known where the law is evaluated: at the end of each step, and on both sides of a jump. If an end is higher
 than both its neighbours, the law is evaluated in between, until the parabola through three values promises no further
-rise: to 1e-5 of the value. The same holds for large formations, whose multipliers are iterated, with one exception:
-constraint forces and tensions below a tenth of the greatest thrust are found to 1e-6 of that thrust, the accuracy that
-the solver's residual allows. Large formations use a separate solver for these evaluations
-(`LargeSolver.thread_solver`), because a solver keeps state and another thread calls the monitor. The flight is
-therefore the same to the bit with and without a monitor. The extremes do not depend on where the trail is cut, because
-the order of evaluations does not.
+rise: to 1e-5 of the value. What integration leaves of forces that are none is not searched: constraint forces and
+tensions are found to 1e-9 of the greatest thrust if that is more, and constraint errors to 1e-9 m. In large formations,
+whose multipliers are iterated, it is 1e-6 of that thrust, the accuracy that the solver's residual allows. Large
+formations use a separate solver for these evaluations (`LargeSolver.thread_solver`), because a solver keeps state and
+another thread calls the monitor. The flight is therefore the same to the bit with and without a monitor. The extremes
+do not depend on where the trail is cut, because the order of evaluations does not.
 """
 
 import math
@@ -67,8 +67,9 @@ from rigidfleet.kernel.records import (
 from rigidfleet.kernel.rigid_body import attitude_matrix, inertia_inverse
 from rigidfleet.solids.distance import STEEP, box_normal
 
-#: Relative accuracy of a greatest force, direct and iterated.
-_CLOSE_FORCE, _CLOSE_ITERATED = 1e-7, 1e-6
+#: Relative accuracy of a greatest force, direct and iterated; that of constraint forces and tensions next to nothing,
+#: as a share of the greatest thrust, and of such constraint errors [m].
+_CLOSE_FORCE, _CLOSE_ITERATED, _CLOSE_SMALL = 1e-7, 1e-6, 1e-10
 #: Greatest rotation of one piece of a step in the body formulation [rad].
 _TURN = 0.1
 #: Least interval in which a peak of forces is searched, as a share of the whole interval.
@@ -545,12 +546,13 @@ def parabola_excess(c, a, b, v, ta, tb, tc, p, monitor):
     top = 0.5 * (ta + tb) - 0.5 * left / bend
     gain = -bend * (top - tb) ** 2
     worst = worst_so_far(c, p, monitor)
-    close = _CLOSE_FORCE * worst
-    if p.graph.solver != 0:
-        # The solver's residual makes an error of constraint forces and tensions in proportion to the greatest force.
-        n, m = p.vehicles.m.shape[0], p.graph.edges.shape[0]
-        within = 2 * n <= c < 3 * n + m
-        close = _CLOSE_ITERATED * (max(worst, -monitor.worst[THRUST]) if within else worst)
+    n, m, direct = p.vehicles.m.shape[0], p.graph.edges.shape[0], p.graph.solver == 0
+    close = (_CLOSE_FORCE if direct else _CLOSE_ITERATED) * worst
+    if 2 * n <= c < 3 * n + m:
+        # Rounding and steps, or the solver's residual, make an error in proportion to the greatest force.
+        close = max(close, (_CLOSE_SMALL if direct else _CLOSE_ITERATED) * -monitor.worst[THRUST])
+    elif 3 * n + m <= c < 3 * n + 2 * m:
+        close = max(close, _CLOSE_SMALL)
     beyond = b + 2.0 * gain - worst - close
     if not beyond > 0.0:
         return 0.0, tb
