@@ -496,23 +496,20 @@ def update_force_extremes(values, t, p, monitor):
 
 
 @jit
-def worst_so_far(entry, p, monitor):
-    """The greatest value so far of the quantity of an entry of a gauge."""
-    n, m = p.vehicles.m.shape[0], p.graph.edges.shape[0]
-    of_agent = entry if entry < 3 * n else entry - 3 * n - 2 * m  # negative of an edge
-    if of_agent >= 0 and not monitor.left[of_agent % n]:
-        return math.inf
-    if entry < n:
-        limit = p.vehicles.thrust_limit[entry]
-        beyond = limit - monitor.worst[THRUST_MARGIN] if limit < math.inf else math.inf
-        return min(-monitor.worst[THRUST], beyond)
-    if entry < 2 * n:
-        return -monitor.worst[ACCELERATION]
-    if entry < 3 * n:
-        return -monitor.worst[CONSTRAINT_FORCE]
-    if of_agent >= 0:
-        return -monitor.worst[HORIZONTAL_ACCELERATION + of_agent // n]
-    return -monitor.worst[TENSION if entry < 3 * n + m else CONSTRAINT]
+def write_worst_forces(p, monitor, out):
+    """Write the greatest value so far of the quantity of each entry of a gauge; infinity for an agent that is lost."""
+    n, m, worst = p.vehicles.m.shape[0], p.graph.edges.shape[0], monitor.worst
+    for i in range(n):
+        limit, left = p.vehicles.thrust_limit[i], monitor.left[i]
+        beyond = limit - worst[THRUST_MARGIN] if limit < math.inf else math.inf
+        out[i] = min(-worst[THRUST], beyond) if left else math.inf
+        out[n + i] = -worst[ACCELERATION] if left else math.inf
+        out[2 * n + i] = -worst[CONSTRAINT_FORCE] if left else math.inf
+        if out.shape[0] > 3 * n + 2 * m:
+            out[3 * n + 2 * m + i] = -worst[HORIZONTAL_ACCELERATION] if left else math.inf
+            out[4 * n + 2 * m + i] = -worst[VERTICAL_ACCELERATION] if left else math.inf
+    for k in range(m):
+        out[3 * n + k], out[3 * n + m + k] = -worst[TENSION], -worst[CONSTRAINT]
 
 
 @jit
@@ -532,7 +529,7 @@ def evaluate_forces(t, step, p, w, state, monitor, values):
 
 
 @jit
-def parabola_excess(c, a, b, v, ta, tb, tc, p, monitor):
+def parabola_excess(c, worst, a, b, v, ta, tb, tc, p, monitor):
     """Expected excess over the worst value, and its time, from the parabola through |values| a, b, v at ta < tb < tc.
 
     The excess of entry c is a share of the worst value, with the rise to the top of the parabola counted twice. It is
@@ -545,7 +542,6 @@ def parabola_excess(c, a, b, v, ta, tb, tc, p, monitor):
         return 0.0, tb
     top = 0.5 * (ta + tb) - 0.5 * left / bend
     gain = -bend * (top - tb) ** 2
-    worst = worst_so_far(c, p, monitor)
     n, m, direct = p.vehicles.m.shape[0], p.graph.edges.shape[0], p.graph.solver == 0
     close = (_CLOSE_FORCE if direct else _CLOSE_ITERATED) * worst
     if 2 * n <= c < 3 * n + m:
@@ -563,6 +559,25 @@ def parabola_excess(c, a, b, v, ta, tb, tc, p, monitor):
 
 
 @jit
+def most_promising_peak(before, middle, after, ta, tb, tc, best, top, p, monitor):
+    """The greatest `parabola_excess` of all entries, and its time; ``best`` and ``top`` if none is greater.
+
+    Few entries pass the bound by the worst values, which are ``monitor.gauge[2]``.
+    """
+    # Twice the rise of a parabola above its middle value is at most the greater one of these shares of both falls.
+    x, y = tb - ta, tc - tb
+    left, right = 0.5 * y * y / (x * (x + y)), 0.5 * x * x / (y * (x + y))
+    worst = monitor.gauge[2]
+    for c in range(middle.shape[0]):
+        a, b, v = abs(before[c]), abs(middle[c]), abs(after[c])
+        if b + max(left * (b - a), right * (b - v)) > worst[c]:
+            more, at = parabola_excess(c, worst[c], a, b, v, ta, tb, tc, p, monitor)
+            if more > best:
+                best, top = more, at
+    return best, top
+
+
+@jit
 def search_forces_in(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
     """Search for the greatest forces between ta and tc, from gauges at ta < tb < tc.
 
@@ -571,13 +586,8 @@ def search_forces_in(before, middle, after, step, ta, tb, tc, p, w, state, monit
     parabola promises a further rise.
     """
     at, rank, values = monitor.instants, monitor.rank, monitor.nodes
-    best, top = 0.0, tb
-    for c in range(middle.shape[0]):
-        a, b, v = abs(before[c]), abs(middle[c]), abs(after[c])
-        if b >= a and b >= v:
-            more, x = parabola_excess(c, a, b, v, ta, tb, tc, p, monitor)
-            if more > best:
-                best, top = more, x
+    write_worst_forces(p, monitor, monitor.gauge[2])
+    best, top = most_promising_peak(before, middle, after, ta, tb, tc, 0.0, tb, p, monitor)
     if best == 0.0:
         return
     for c in range(middle.shape[0]):
@@ -588,6 +598,7 @@ def search_forces_in(before, middle, after, step, ta, tb, tc, p, w, state, monit
     for count in range(3, at.shape[0]):
         in_step = step if top <= step_end_time(step, state) else step + 1
         evaluate_forces(top, in_step, p, w, state, monitor, values[count])
+        write_worst_forces(p, monitor, monitor.gauge[2])
         # Into its place by time: values stay where they are, ``rank`` says their order.
         k = count
         while at[rank[k - 1]] > top:
@@ -599,12 +610,9 @@ def search_forces_in(before, middle, after, step, ta, tb, tc, p, w, state, monit
             i, j, l = rank[k - 1], rank[k], rank[k + 1]
             if at[l] - at[i] < _NARROW * (tc - ta):
                 continue
-            for c in range(middle.shape[0]):
-                a, b, v = abs(values[i, c]), abs(values[j, c]), abs(values[l, c])
-                if b >= a and b >= v:
-                    more, x = parabola_excess(c, a, b, v, at[i], at[j], at[l], p, monitor)
-                    if more > best:
-                        best, top = more, x
+            best, top = most_promising_peak(
+                values[i], values[j], values[l], at[i], at[j], at[l], best, top, p, monitor
+            )
         if best == 0.0:
             return
 

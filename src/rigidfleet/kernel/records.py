@@ -112,7 +112,7 @@ class Monitor(NamedTuple):
     record: int
     time: Floats  # (1,) [s]
     states: Floats  # (1, n)
-    gauge: Floats  # (2, 3N + 2m or more) forces before the first step, and in the middle of one
+    gauge: Floats  # (3, 3N + 2m or more) forces before the first step, in the middle of one, and the greatest so far
     nodes: Floats  # (27, 3N + 2m or more) forces at points of two steps
     instants: Floats  # (27,) times of these points [s]
     rank: Ints  # (27,) their order in time
@@ -140,7 +140,7 @@ def new_monitor(
     return Monitor(
         radius=radius, boxes=boxes, fence=fence, count=np.zeros(1, dtype=np.int64), moves=np.zeros(2),
         recorder=0, segment=0, record=0, time=np.zeros(1),
-        states=np.zeros((1, states)), gauge=np.zeros((2, gauge)),
+        states=np.zeros((1, states)), gauge=np.zeros((3, gauge)),
         nodes=np.empty((_NODES, gauge)), instants=np.zeros(_NODES), rank=np.zeros(_NODES, dtype=np.int64),
         world=np.zeros((5, 6 * n)), balls=np.zeros((n, 4)), curves=np.zeros((2, 5, 3)), work=np.zeros((40, 11)),
         pieces=np.zeros((40, 17)), basis=np.zeros((5, 5)), attitudes=np.zeros((5, 3, 3)),
