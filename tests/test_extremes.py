@@ -1,5 +1,6 @@
 """Extremes in continuous time, against the same steps and continuous extension sampled finely."""
 
+import ctypes
 import math
 import threading
 import time
@@ -10,6 +11,7 @@ import pytest
 
 from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
+from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.records import FIRST_ROW, STAYED, TRAILED, bernstein_basis
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -197,6 +199,36 @@ def test_forces_between_samples_are_found():
         assert abs(x.value) >= value * (1.0 - 1e-9)
         near = simulate(mission, times=x.time + np.linspace(-5e-3, 5e-3, 2001))
         assert forces(near)[name] == pytest.approx(abs(x.value), rel=1e-5)
+
+
+def test_constraint_forces_next_to_nothing_are_not_searched(monkeypatch):
+    """Where a formation keeps its distances, few calls of the law tell them to 1e-9 of the thrust and 1e-9 m."""
+    calls: list[int] = []
+    word, record = ctypes.c_int64, native.library().record
+
+    def counted(*words: int) -> int:
+        calls.append(1)
+        return record(*words)
+
+    entry = ctypes.CFUNCTYPE(word, *(word,) * 4)(counted)
+    address = ctypes.cast(entry, ctypes.c_void_p).value
+    monkeypatch.setattr(native, "recorder_address", lambda: address)
+    result = simulate(changed("narrow-passage", output_step=0.002))
+    assert len(calls) < 5 * len(result.phases)
+    quiet = 0
+    for phase in result.phases:
+        inside = (result.time > phase.t_start) & (result.time < phase.t_end)
+        fine = {
+            "constraint_force": np.linalg.norm(result.constraint_force[inside], axis=2).max(),
+            "tension": np.abs(result.multiplier[inside]).max(),
+            "constraint": np.abs(result.constraint[inside]).max(),
+        }
+        thrust = phase.extremes["thrust"].value
+        for name, value in fine.items():
+            slack = 1e-5 * value + (1e-9 if name == "constraint" else 1e-9 * thrust)
+            assert abs(phase.extremes[name].value) >= value - slack
+        quiet += fine["tension"] < 1e-7
+    assert quiet > 8
 
 
 @pytest.mark.parametrize("step", [0.05, 1.0])

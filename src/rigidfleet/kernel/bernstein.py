@@ -150,14 +150,16 @@ def point_at(curve, x):
 
 
 @jit
-def least_norm_of_curve(curve, to_beat, work, pieces):
-    """Least |r| of a curve with control points (5, 3) and its place, if below ``to_beat``; else ``to_beat`` and -1.
+def least_norm_of_curve(to_beat, work, pieces):
+    """Least |r| of a curve and its place, if below ``to_beat``; else ``to_beat`` and -1.
+
+    The curve's control points (15,) are ``pieces[0]``.
 
     Rounding of a squared length of some metres hides lengths of a millimetre. Therefore both halves of a long piece
     are examined again once their least length is roughly known.
     """
     best, at, top, count = to_beat, -1.0, 0, 0
-    start_piece_stack(curve, pieces)
+    start_piece_stack(pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
         middle, along, size = 0.0, math.inf, 0.0
@@ -232,13 +234,11 @@ def halve_or_prune_piece(bound, best, at, close, count, top, pieces):
 
 
 @jit
-def start_piece_stack(curve, pieces):
-    """Put a curve with control points (5, 3) on an empty stack; returns the accuracy that its rounding allows [m]."""
+def start_piece_stack(pieces):
+    """Start a stack with the curve ``pieces[0]`` (15 control points); returns the accuracy that its rounding allows."""
     close = CLOSE
-    for k in range(5):
-        for q in range(3):
-            pieces[0, 3 * k + q] = curve[k, q]
-            close = max(close, _ROUNDING * abs(curve[k, q]))
+    for k in range(15):
+        close = max(close, _ROUNDING * abs(pieces[0, k]))
     pieces[0, 15], pieces[0, 16] = 0.0, 1.0
     return close
 
@@ -249,7 +249,10 @@ def distance_to_box(curve, b, part, to_beat, pieces, boxes):
 
     `obstacles` makes of this source the same for any solid, or a ``part`` of one, by another `tangent_of_box`.
     """
-    best, at, top, count, close = to_beat, -1.0, 0, 0, start_piece_stack(curve, pieces)
+    for k in range(5):
+        for q in range(3):
+            pieces[0, 3 * k + q] = curve[k, q]
+    best, at, top, count, close = to_beat, -1.0, 0, 0, start_piece_stack(pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
         distance, x, y, z = tangent_of_box(piece[6], piece[7], piece[8], b, part, boxes)
@@ -266,9 +269,9 @@ def distance_to_box(curve, b, part, to_beat, pieces, boxes):
 
 
 @jit
-def least_height_in_cylinder(points, reach, to_beat, pieces):
-    """Least |z| of a curve with control points (5, 3) while within ``reach`` of the z axis, and its place."""
-    best, at, top, count, close = to_beat, -1.0, 0, 0, start_piece_stack(points, pieces)
+def least_height_in_cylinder(reach, to_beat, pieces):
+    """Least |z| of a curve with control points ``pieces[0]`` while within ``reach`` of the z axis, and its place."""
+    best, at, top, count, close = to_beat, -1.0, 0, 0, start_piece_stack(pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
         for k in (0, 4):
@@ -294,9 +297,9 @@ def least_height_in_cylinder(points, reach, to_beat, pieces):
 
 
 @jit
-def least_norm_above(curve, own, other, altitude, to_beat, pieces):
-    """Least |r| of a curve with control points (5, 3) while one of two others is at z >= ``altitude``; its place."""
-    best, at, top, count, close, rate = to_beat, -1.0, 0, 0, start_piece_stack(curve, pieces), 0.0
+def least_norm_above(own, other, altitude, to_beat, pieces):
+    """Least |r| of a curve ``pieces[0]`` while one of two others (5, 3) is at z >= ``altitude``, and its place."""
+    best, at, top, count, close, rate = to_beat, -1.0, 0, 0, start_piece_stack(pieces), 0.0
     for k in range(1, 5):
         rate = max(rate, abs(own[k, 2] - own[k - 1, 2]), abs(other[k, 2] - other[k - 1, 2]))
     while top >= 0:

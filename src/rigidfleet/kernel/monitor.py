@@ -9,12 +9,12 @@ are exact to 1e-9 of the formation's size.
 
 Forces are known where the law is evaluated: at the end of each step, and on both sides of a jump. If an end is higher
 than both its neighbours, the law is evaluated in between, until the parabola through three values promises no further
-rise: to 1e-5 of the value. The same holds for large formations, whose multipliers are iterated, with one exception:
-constraint forces and tensions below a tenth of the greatest thrust are found to 1e-6 of that thrust, the accuracy that
-the solver's residual allows. Large formations use a separate solver for these evaluations
-(`LargeSolver.thread_solver`), because a solver keeps state and another thread calls the monitor. The flight is
-therefore the same to the bit with and without a monitor. The extremes do not depend on where the trail is cut, because
-the order of evaluations does not.
+rise: to 1e-5 of the value. What integration leaves of forces that are none is not searched: constraint forces and
+tensions are found to 1e-9 of the greatest thrust if that is more, and constraint errors to 1e-9 m. In large formations,
+whose multipliers are iterated, it is 1e-6 of that thrust, the accuracy that the solver's residual allows. Large
+formations use a separate solver for these evaluations (`LargeSolver.thread_solver`), because a solver keeps state and
+another thread calls the monitor. The flight is therefore the same to the bit with and without a monitor. The extremes
+do not depend on where the trail is cut, because the order of evaluations does not.
 """
 
 import math
@@ -67,8 +67,9 @@ from rigidfleet.kernel.records import (
 from rigidfleet.kernel.rigid_body import attitude_matrix, inertia_inverse
 from rigidfleet.solids.distance import STEEP, box_normal
 
-#: Relative accuracy of a greatest force, direct and iterated.
-_CLOSE_FORCE, _CLOSE_ITERATED = 1e-7, 1e-6
+#: Relative accuracy of a greatest force, direct and iterated; that of constraint forces and tensions next to nothing,
+#: as a share of the greatest thrust, and of such constraint errors [m].
+_CLOSE_FORCE, _CLOSE_ITERATED, _CLOSE_SMALL = 1e-7, 1e-6, 1e-10
 #: Greatest rotation of one piece of a step in the body formulation [rad].
 _TURN = 0.1
 #: Least interval in which a peak of forces is searched, as a share of the whole interval.
@@ -141,29 +142,25 @@ def bernstein_column_value(basis, points, q):
 
 
 @jit
-def world_control_points(points, i, derivative, p, monitor, out):
-    """Control points (5, 3) of agent i's position in the world, or of its velocity (``derivative`` 1)."""
+def write_world_control_points(points, part, parts, p, monitor):
+    """Write control points (5, 6N) of positions and velocities in the world over a piece of a step in body axes."""
+    write_body_frames(points, part, parts, p, monitor)
+    at_knots, in_body, out = monitor.knots, monitor.scratch[1], monitor.world
     n = p.vehicles.m.shape[0]
-    first = 3 * i + 3 * n * derivative
-    if not p.body_formulation:
+    for i in range(2 * n):  # positions, then velocities
+        for k in range(5):
+            T = monitor.attitudes[k]
+            for q in range(3):
+                in_body[q] = bernstein_column_value(monitor.basis[k], points, 3 * i + q)
+            for q in range(3):
+                at_knots[k, q] = monitor.centres[k, 3 * (i // n) + q]
+                for s in range(3):
+                    at_knots[k, q] += T[s, q] * in_body[s]
         for k in range(5):
             for q in range(3):
-                out[k, q] = points[k, first + q]
-        return
-    at_knots, in_body = monitor.knots, monitor.scratch[1]
-    for k in range(5):
-        T = monitor.attitudes[k]
-        for q in range(3):
-            in_body[q] = bernstein_column_value(monitor.basis[k], points, first + q)
-        for q in range(3):
-            at_knots[k, q] = monitor.centres[k, 3 * derivative + q]
-            for s in range(3):
-                at_knots[k, q] += T[s, q] * in_body[s]
-    for k in range(5):
-        for q in range(3):
-            out[k, q] = 0.0
-            for j in range(5):
-                out[k, q] += FROM_KNOTS[k, j] * at_knots[j, q]
+                out[k, 3 * i + q] = 0.0
+                for j in range(5):
+                    out[k, 3 * i + q] += FROM_KNOTS[k, j] * at_knots[j, q]
 
 
 # -- distances ---------------------------------------------------------------------------------------
@@ -267,16 +264,16 @@ def bound_distance_changes(p, state, monitor):
 
 
 @jit
-def enclose_points(curve, ball):
-    """Write into a ball (4,) the middle one of control points (5, 3), and the least radius [m] that holds all."""
-    ball[0], ball[1], ball[2], ball[3] = curve[2, 0], curve[2, 1], curve[2, 2], ball_radius(curve)
-
-
-@jit
 def enclose_agents(points, monitor):
-    """Balls that hold the agents' positions over a step, in the axes of the states."""
+    """Balls about the agents' middle control points that hold their positions over a step."""
     for i in range(monitor.balls.shape[0]):
-        enclose_points(points[:, 3 * i : 3 * i + 3], monitor.balls[i])
+        curve, ball = points[:, 3 * i : 3 * i + 3], monitor.balls[i]
+        ball[0], ball[1], ball[2], ball[3] = (
+            curve[2, 0],
+            curve[2, 1],
+            curve[2, 2],
+            ball_radius(curve),
+        )
 
 
 @jit
@@ -297,11 +294,11 @@ def surely_apart(i, j, n_axes, reach, monitor):
 def watch_pairs(kind, pairs, points, t, h, monitor):
     """Least distance, or height, between the surfaces of pairs of agents (P, 2) over a step.
 
-    Distances, which no axes change, are those of the step's control points (5, n); heights, and distances while one
-    of the two is at the altitude that counts, are those of curves in world axes.
+    Distances may be those in any axes; heights, and distances while one of the two is at the altitude that counts,
+    are those of control points (5, n) in world axes.
     """
     below, flying = kind == SEPARATION_BELOW, kind == SEPARATION_FLYING
-    axes, curve = 2 if below else 3, monitor.curve
+    axes, pieces = 2 if below else 3, monitor.pieces
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
         # Surfaces that overlap count by how deep, so that the floor may be below the sum of the radii.
@@ -309,19 +306,16 @@ def watch_pairs(kind, pairs, points, t, h, monitor):
         floor = monitor.worst[kind] + radii
         if surely_apart(i, j, axes, radii if below else floor, monitor):
             continue
-        own, other = monitor.places[i], monitor.places[j]
+        own, other = points[:, 3 * i : 3 * i + 3], points[:, 3 * j : 3 * j + 3]
         for s in range(5):
             for q in range(3):
-                if below or flying:
-                    curve[s, q] = own[s, q] - other[s, q]
-                else:
-                    curve[s, q] = points[s, 3 * i + q] - points[s, 3 * j + q]
+                pieces[0, 3 * s + q] = own[s, q] - other[s, q]
         if below:
-            value, at = least_height_in_cylinder(curve, radii, floor, monitor.pieces)
+            value, at = least_height_in_cylinder(radii, floor, pieces)
         elif flying:
-            value, at = least_norm_above(curve, own, other, monitor.altitude, floor, monitor.pieces)
+            value, at = least_norm_above(own, other, monitor.altitude, floor, pieces)
         else:
-            value, at = least_norm_of_curve(curve, floor, monitor.work, monitor.pieces)
+            value, at = least_norm_of_curve(floor, monitor.work, pieces)
         if at >= 0.0:
             store_if_worse(kind, value - radii, t + at * h, i, j, monitor)
 
@@ -331,9 +325,10 @@ def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
     """Least of sign r[axis] - offset over a curve (5, 3)."""
     work, bound = monitor.work, math.inf
     for k in range(5):
-        work[0, k] = sign * curve[k, axis] - offset
-        bound = min(bound, work[0, k])
+        bound = min(bound, sign * curve[k, axis] - offset)
     if bound < monitor.worst[kind] - CLOSE:
+        for k in range(5):
+            work[0, k] = sign * curve[k, axis] - offset
         value, at = least_polynomial_value(work, 4, monitor.worst[kind])
         if at >= 0.0:
             store_if_worse(kind, value, t + at * h, i, -1, monitor)
@@ -345,13 +340,15 @@ def watch_speed(kind, curve, low, high, t, h, i, monitor):
     fastest, piece = 0.0, monitor.pieces[0]
     for k in range(5):
         size = 0.0
-        for q in range(3):
-            piece[3 * k + q] = curve[k, q] if low <= q < high else 0.0
-            size += piece[3 * k + q] ** 2
+        for q in range(low, high):
+            size += curve[k, q] ** 2
         fastest = max(fastest, size)
     greatest = -monitor.worst[kind]  # -inf at first
     if fastest <= greatest * abs(greatest):
         return
+    for k in range(5):
+        for q in range(3):
+            piece[3 * k + q] = curve[k, q] if low <= q < high else 0.0
     squared_norm_coefficients(piece, -1.0, monitor.work[0])
     _, at = least_polynomial_value(monitor.work, 8, -greatest * abs(greatest))
     if at >= 0.0:
@@ -402,9 +399,9 @@ def watch_obstacles(i, curve, t, h, last, monitor):
     """
     radius, standing = monitor.radius[i], monitor.standing[i] != 0
     x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], monitor.balls[i, 3]
+    floor = clearance_to_beat(i, monitor) + radius
     for b in range(monitor.boxes.shape[0]):
         box = monitor.boxes[b]
-        floor = clearance_to_beat(i, monitor) + radius
         far = max(0.0, box[0] - x, x - box[3]) ** 2 + max(0.0, box[1] - y, y - box[4]) ** 2
         far += max(0.0, box[2] - z, z - box[5]) ** 2
         if far >= (floor + span) ** 2 and floor + span > 0.0:  # far from the whole obstacle
@@ -414,6 +411,7 @@ def watch_obstacles(i, curve, t, h, last, monitor):
             x_near, y_near, z_near = point_at(curve, at)
             _, _, up = box_normal(x_near, y_near, z_near, box)
             store_clearance(value - radius, t + at * h, i, b, up >= STEEP, monitor)
+            floor = clearance_to_beat(i, monitor) + radius
     if not last or not (standing or monitor.low[i, 0] < math.inf):
         return
     for b in range(monitor.boxes.shape[0]):
@@ -433,7 +431,7 @@ def watch_trail_distances(first, end, p, state, monitor):
 @jit
 def watch_step_distances(step, p, state, monitor):
     """Take the extremes of distances and speeds over one step of the trail."""
-    trail, row = state.trail, trail_row_of(step, state)
+    trail, row, n = state.trail, trail_row_of(step, state), monitor.left.shape[0]
     points, t, h = trail.points[row], trail.clock[row, 0], trail.clock[row, 1]
     enclose_agents(points, monitor)
     watch_pairs(SEPARATION, monitor.pairs, points, t, h, monitor)
@@ -443,20 +441,19 @@ def watch_step_distances(step, p, state, monitor):
     h /= parts
     for part in range(parts):
         start = t + part * h
+        world = monitor.world if p.body_formulation else points
         if p.body_formulation:
-            write_body_frames(points, part, parts, p, monitor)
-        for i in range(monitor.left.shape[0]):
+            write_world_control_points(points, part, parts, p, monitor)
+            enclose_agents(world, monitor)
+        for i in range(n):
             if not monitor.left[i]:
                 continue
-            curve = monitor.curve
-            world_control_points(points, i, 1, p, monitor, curve)
+            curve = world[:, 3 * (n + i) : 3 * (n + i) + 3]
             watch_speed(SPEED, curve, 0, 3, start, h, i, monitor)
             if monitor.worst[HORIZONTAL_SPEED] > -math.inf:
                 watch_speed(HORIZONTAL_SPEED, curve, 0, 2, start, h, i, monitor)
                 watch_speed(VERTICAL_SPEED, curve, 2, 3, start, h, i, monitor)
-            curve = monitor.places[i]
-            world_control_points(points, i, 0, p, monitor, curve)
-            enclose_points(curve, monitor.balls[i])
+            curve = world[:, 3 * i : 3 * i + 3]
             watch_coordinate(LOWEST, curve, 2, 1.0, 0.0, start, h, i, monitor)
             watch_coordinate(HIGHEST, curve, 2, -1.0, 0.0, start, h, i, monitor)
             for f in range(monitor.fence.shape[0]):
@@ -466,9 +463,9 @@ def watch_step_distances(step, p, state, monitor):
                     watch_coordinate(GEOFENCE, curve, q, -1.0, -high, start, h, i, monitor)
             if monitor.boxes.shape[0] > 0:
                 watch_obstacles(i, curve, start, h, part == parts - 1, monitor)
-        watch_pairs(SEPARATION_BELOW, monitor.columns, points, start, h, monitor)
+        watch_pairs(SEPARATION_BELOW, monitor.columns, world, start, h, monitor)
         if monitor.altitude < math.inf:
-            watch_pairs(SEPARATION_FLYING, monitor.pairs, points, start, h, monitor)
+            watch_pairs(SEPARATION_FLYING, monitor.pairs, world, start, h, monitor)
 
 
 # -- forces ------------------------------------------------------------------------------------------
@@ -499,23 +496,20 @@ def update_force_extremes(values, t, p, monitor):
 
 
 @jit
-def worst_so_far(entry, p, monitor):
-    """The greatest value so far of the quantity of an entry of a gauge."""
-    n, m = p.vehicles.m.shape[0], p.graph.edges.shape[0]
-    of_agent = entry if entry < 3 * n else entry - 3 * n - 2 * m  # negative of an edge
-    if of_agent >= 0 and not monitor.left[of_agent % n]:
-        return math.inf
-    if entry < n:
-        limit = p.vehicles.thrust_limit[entry]
-        beyond = limit - monitor.worst[THRUST_MARGIN] if limit < math.inf else math.inf
-        return min(-monitor.worst[THRUST], beyond)
-    if entry < 2 * n:
-        return -monitor.worst[ACCELERATION]
-    if entry < 3 * n:
-        return -monitor.worst[CONSTRAINT_FORCE]
-    if of_agent >= 0:
-        return -monitor.worst[HORIZONTAL_ACCELERATION + of_agent // n]
-    return -monitor.worst[TENSION if entry < 3 * n + m else CONSTRAINT]
+def write_worst_forces(p, monitor, out):
+    """Write the greatest value so far of the quantity of each entry of a gauge; infinity for an agent that is lost."""
+    n, m, worst = p.vehicles.m.shape[0], p.graph.edges.shape[0], monitor.worst
+    for i in range(n):
+        limit, left = p.vehicles.thrust_limit[i], monitor.left[i]
+        beyond = limit - worst[THRUST_MARGIN] if limit < math.inf else math.inf
+        out[i] = min(-worst[THRUST], beyond) if left else math.inf
+        out[n + i] = -worst[ACCELERATION] if left else math.inf
+        out[2 * n + i] = -worst[CONSTRAINT_FORCE] if left else math.inf
+        if out.shape[0] > 3 * n + 2 * m:
+            out[3 * n + 2 * m + i] = -worst[HORIZONTAL_ACCELERATION] if left else math.inf
+            out[4 * n + 2 * m + i] = -worst[VERTICAL_ACCELERATION] if left else math.inf
+    for k in range(m):
+        out[3 * n + k], out[3 * n + m + k] = -worst[TENSION], -worst[CONSTRAINT]
 
 
 @jit
@@ -535,7 +529,7 @@ def evaluate_forces(t, step, p, w, state, monitor, values):
 
 
 @jit
-def parabola_excess(c, a, b, v, ta, tb, tc, p, monitor):
+def parabola_excess(c, worst, a, b, v, ta, tb, tc, p, monitor):
     """Expected excess over the worst value, and its time, from the parabola through |values| a, b, v at ta < tb < tc.
 
     The excess of entry c is a share of the worst value, with the rise to the top of the parabola counted twice. It is
@@ -548,13 +542,13 @@ def parabola_excess(c, a, b, v, ta, tb, tc, p, monitor):
         return 0.0, tb
     top = 0.5 * (ta + tb) - 0.5 * left / bend
     gain = -bend * (top - tb) ** 2
-    worst = worst_so_far(c, p, monitor)
-    close = _CLOSE_FORCE * worst
-    if p.graph.solver != 0:
-        # The solver's residual makes an error of constraint forces and tensions in proportion to the greatest force.
-        n, m = p.vehicles.m.shape[0], p.graph.edges.shape[0]
-        within = 2 * n <= c < 3 * n + m
-        close = _CLOSE_ITERATED * (max(worst, -monitor.worst[THRUST]) if within else worst)
+    n, m, direct = p.vehicles.m.shape[0], p.graph.edges.shape[0], p.graph.solver == 0
+    close = (_CLOSE_FORCE if direct else _CLOSE_ITERATED) * worst
+    if 2 * n <= c < 3 * n + m:
+        # Rounding and steps, or the solver's residual, make an error in proportion to the greatest force.
+        close = max(close, (_CLOSE_SMALL if direct else _CLOSE_ITERATED) * -monitor.worst[THRUST])
+    elif 3 * n + m <= c < 3 * n + 2 * m:
+        close = max(close, _CLOSE_SMALL)
     beyond = b + 2.0 * gain - worst - close
     if not beyond > 0.0:
         return 0.0, tb
@@ -562,6 +556,25 @@ def parabola_excess(c, a, b, v, ta, tb, tc, p, monitor):
     if abs(top - tb) < short:
         top = tb + short if tc - tb > tb - ta else tb - short
     return beyond / worst, top
+
+
+@jit
+def most_promising_peak(before, middle, after, ta, tb, tc, best, top, p, monitor):
+    """The greatest `parabola_excess` of all entries, and its time; ``best`` and ``top`` if none is greater.
+
+    Few entries pass the bound by the worst values, which are ``monitor.gauge[2]``.
+    """
+    # Twice the rise of a parabola above its middle value is at most the greater one of these shares of both falls.
+    x, y = tb - ta, tc - tb
+    left, right = 0.5 * y * y / (x * (x + y)), 0.5 * x * x / (y * (x + y))
+    worst = monitor.gauge[2]
+    for c in range(middle.shape[0]):
+        a, b, v = abs(before[c]), abs(middle[c]), abs(after[c])
+        if b + max(left * (b - a), right * (b - v)) > worst[c]:
+            more, at = parabola_excess(c, worst[c], a, b, v, ta, tb, tc, p, monitor)
+            if more > best:
+                best, top = more, at
+    return best, top
 
 
 @jit
@@ -573,13 +586,8 @@ def search_forces_in(before, middle, after, step, ta, tb, tc, p, w, state, monit
     parabola promises a further rise.
     """
     at, rank, values = monitor.instants, monitor.rank, monitor.nodes
-    best, top = 0.0, tb
-    for c in range(middle.shape[0]):
-        a, b, v = abs(before[c]), abs(middle[c]), abs(after[c])
-        if b >= a and b >= v:
-            more, x = parabola_excess(c, a, b, v, ta, tb, tc, p, monitor)
-            if more > best:
-                best, top = more, x
+    write_worst_forces(p, monitor, monitor.gauge[2])
+    best, top = most_promising_peak(before, middle, after, ta, tb, tc, 0.0, tb, p, monitor)
     if best == 0.0:
         return
     for c in range(middle.shape[0]):
@@ -590,6 +598,7 @@ def search_forces_in(before, middle, after, step, ta, tb, tc, p, w, state, monit
     for count in range(3, at.shape[0]):
         in_step = step if top <= step_end_time(step, state) else step + 1
         evaluate_forces(top, in_step, p, w, state, monitor, values[count])
+        write_worst_forces(p, monitor, monitor.gauge[2])
         # Into its place by time: values stay where they are, ``rank`` says their order.
         k = count
         while at[rank[k - 1]] > top:
@@ -601,12 +610,9 @@ def search_forces_in(before, middle, after, step, ta, tb, tc, p, w, state, monit
             i, j, l = rank[k - 1], rank[k], rank[k + 1]
             if at[l] - at[i] < _NARROW * (tc - ta):
                 continue
-            for c in range(middle.shape[0]):
-                a, b, v = abs(values[i, c]), abs(values[j, c]), abs(values[l, c])
-                if b >= a and b >= v:
-                    more, x = parabola_excess(c, a, b, v, at[i], at[j], at[l], p, monitor)
-                    if more > best:
-                        best, top = more, x
+            best, top = most_promising_peak(
+                values[i], values[j], values[l], at[i], at[j], at[l], best, top, p, monitor
+            )
         if best == 0.0:
             return
 

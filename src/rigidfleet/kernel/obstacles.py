@@ -20,8 +20,7 @@ from rigidfleet.kernel.monitor import (
     frame_rotation_bound,
     note_obstacle_departure,
     store_clearance,
-    world_control_points,
-    write_body_frames,
+    write_world_control_points,
 )
 from rigidfleet.solids.distance import (
     box_distance,
@@ -117,7 +116,7 @@ def point_in_solid_axes(x, y, z, t, b, solids):
 @jit
 def watch_solid(i, b, curve, t, h, solids, monitor):
     """Clearance of agent i's surface to solid b over a piece of a step."""
-    radius, part, own = monitor.radius[i], monitor.curves[1], monitor.curves[2]
+    radius, part, own = monitor.radius[i], monitor.curves[0], monitor.curves[1]
     start, stop, way, last = 0.0, 1.0, solids.first[b, 3], solids.last[b, 3]
     if solids.there[b, 0] > t:
         start = (solids.there[b, 0] - t) / h
@@ -178,16 +177,17 @@ def watch_departure(i, curve, t, s, monitor):
 @jit
 def watch_clearances(points, start, length, p, solids, monitor):
     """Take the clearances of a step from ``start`` of a ``length`` [s]: control points (5, n) of the states."""
-    curve, parts = monitor.curves[0], count_pieces(frame_rotation_bound(points, p))
+    parts = count_pieces(frame_rotation_bound(points, p))
     h = length / parts
     for part in range(parts):
         t = start + part * h
+        world = monitor.world if p.body_formulation else points
         if p.body_formulation:
-            write_body_frames(points, part, parts, p, monitor)
+            write_world_control_points(points, part, parts, p, monitor)
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
                 continue
-            world_control_points(points, i, 0, p, monitor, curve)
+            curve = world[:, 3 * i : 3 * i + 3]
             for b in range(solids.kind.shape[0]):
                 watch_solid(i, b, curve, t, h, solids, monitor)
             if part == parts - 1:

@@ -112,17 +112,16 @@ class Monitor(NamedTuple):
     record: int
     time: Floats  # (1,) [s]
     states: Floats  # (1, n)
-    gauge: Floats  # (2, 3N + 2m or more) forces before the first step, and in the middle of one
+    gauge: Floats  # (3, 3N + 2m or more) forces before the first step, in the middle of one, and the greatest so far
     nodes: Floats  # (27, 3N + 2m or more) forces at points of two steps
     instants: Floats  # (27,) times of these points [s]
     rank: Ints  # (27,) their order in time
-    # control points of the agents' positions over a step, world axes, if pairs or obstacles need them [m]
-    places: Annotated[Floats, Extents(("N", 5, 3))]
+    # control points of a piece of a step in world axes, in the body formulation: positions [m], velocities [m/s]
+    world: Annotated[Floats, Extents((5, None))]
     # of the ball about the third control point that holds all five: its centre and its radius [m]
     balls: Annotated[Floats, Extents(("N", 4))]
-    curve: Annotated[Floats, Extents((5, 3))]  # of one pair
-    # a path in the world, cut at waypoints, and in the axes of an obstacle
-    curves: Annotated[Floats, Extents((3, 5, 3))]
+    # a path cut at waypoints, and in the axes of an obstacle
+    curves: Annotated[Floats, Extents((2, 5, 3))]
     work: Annotated[Floats, Extents((40, 11))]  # polynomials
     pieces: Annotated[Floats, Extents((40, 17))]  # curves
     basis: Annotated[Floats, Extents((5, 5))]
@@ -141,10 +140,9 @@ def new_monitor(
     return Monitor(
         radius=radius, boxes=boxes, fence=fence, count=np.zeros(1, dtype=np.int64), moves=np.zeros(2),
         recorder=0, segment=0, record=0, time=np.zeros(1),
-        states=np.zeros((1, states)), gauge=np.zeros((2, gauge)),
+        states=np.zeros((1, states)), gauge=np.zeros((3, gauge)),
         nodes=np.empty((_NODES, gauge)), instants=np.zeros(_NODES), rank=np.zeros(_NODES, dtype=np.int64),
-        places=np.zeros((n, 5, 3)), balls=np.zeros((n, 4)), curve=np.zeros((5, 3)),
-        curves=np.zeros((3, 5, 3)), work=np.zeros((40, 11)),
+        world=np.zeros((5, 6 * n)), balls=np.zeros((n, 4)), curves=np.zeros((2, 5, 3)), work=np.zeros((40, 11)),
         pieces=np.zeros((40, 17)), basis=np.zeros((5, 5)), attitudes=np.zeros((5, 3, 3)),
         centres=np.zeros((5, 6)), knots=np.zeros((5, 3)), scratch=np.zeros((3, 10)),
         **watched or {
