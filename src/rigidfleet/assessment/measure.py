@@ -125,12 +125,12 @@ class Measurements:
         for q in (q for q in QUANTITIES.values() if q.by_phase):
             sampled, alone = self.samples_of(q.name), q.name not in self.names_recorded
             ranks = self.worst_ranks(q.name)
-            for phase, part, rank, worst in zip(self.result.phases, self.parts, ranks, every, strict=True):
-                x, e = phase.extremes.get(q.name), None
+            for k, (phase, worst) in enumerate(zip(self.result.phases, every, strict=True)):
+                x, rank, e = phase.extremes.get(q.name), ranks[k], None
                 if x is not None and (rank == -math.inf or rank < q.rank(_in_unit(q, x))):
                     e = self.extreme_of(q.name, x, phase.name)
                 elif rank > -math.inf:
-                    e = self.worst_sample(sampled, part, alone=alone)
+                    e = self.worst_sample(sampled, self.parts[k], alone=alone)
                 if e is not None:
                     worst[q.name] = e
         return every
