@@ -443,7 +443,7 @@ def _read_ulog(path: Path) -> Log:
     return Log({"": channels}, clock, armed, tuple(notes))
 
 
-def channel_of_px4(topic: str, name: str, data: dict[str, Any], after: int = 0) -> Channel:
+def channel_of_px4(topic: str, message: str, data: dict[str, Any], after: int = 0) -> Channel:
     """The samples of a message of PX4, whose times get ``after`` [us] added."""
     # Positions are of the time of the sample, which is a little before that of the message.
     stamp = data.get("timestamp_sample", data["timestamp"]).astype(np.int64)
@@ -451,7 +451,7 @@ def channel_of_px4(topic: str, name: str, data: dict[str, Any], after: int = 0) 
     for field, ned in (("pose_frame", 1), ("local_frame", 0)):
         if field in data:
             data["is_ned"] = data[field] == ned
-    return Channel(topic, name, data, "", _last_geodetic(data, "ref_lat ref_lon ref_alt"))
+    return Channel(topic, message, data, "", _last_geodetic(data, "ref_lat ref_lon ref_alt"))
 
 
 def _collect_columns(log: Any) -> dict[tuple[int, str, int], dict[str, Any]]:

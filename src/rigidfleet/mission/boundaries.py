@@ -156,9 +156,9 @@ class Boundaries:
         return -least_distance(away, way), np.full(len(m), 0.5), -least_distance(away - reach, more)
 
 
-def _distance_outside(region: Region, inclusion: bool, points: Floats, _: Ints) -> Measured:
+def _distance_outside(region: Region, inclusion: bool, curves: Floats, _: Ints) -> Measured:
     """How far curves (M, 6, P) are on the wrong side of a fence [m], see `Measure`."""
-    value, bound = region.curve_depths_and_bounds(points[:, :3], outside=inclusion)
+    value, bound = region.curve_depths_and_bounds(curves[:, :3], outside=inclusion)
     return value, np.full(len(value), 0.5), bound
 
 

@@ -76,7 +76,7 @@ def check_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
         (("allocation",), _torque_allocation_rules),
         (("limits",), _limit_rules),
         (("yaw",), _yaw_rules),
-        ((), _all_obstacle_rules),
+        ((), _each_obstacle_rules),
         ((), _all_area_rules),
         (("formations",), formations.formation_rules),
         ((), _too_many_touching_rules),
@@ -352,7 +352,7 @@ def _corner_rules(box: Any, below: Keys) -> Breaches:
             yield Breach(below, problem, "swap them", None)
 
 
-def _all_obstacle_rules(m: Draft) -> Breaches:
+def _each_obstacle_rules(m: Draft) -> Breaches:
     """Each obstacle by itself."""
     things = []
     for k, data in enumerate(m.tables("obstacles")):

@@ -77,10 +77,10 @@ class Course(NamedTuple):
 
 def course(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:
     """Course of the virtual body in a phase that ends at ``t_end`` [s], from a state with the frame attached."""
-    return _COURSES.get(phase.kind, _stay_course)(mission, phase, now, t_end)
+    return _COURSES.get(phase.kind, _rest_course)(mission, phase, now, t_end)
 
 
-def _stay_course(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:
+def _rest_course(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:
     """Come to rest at the previous goal, or the phase's own place; by the end, if known, as no time is given."""
     arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
     if now.goal is None:
@@ -92,7 +92,7 @@ def _stay_course(mission: Mission, phase: Phase, now: PhaseState, t_end: float) 
 
 def _reshape_course(mission: Mission, phase: Reshape, now: PhaseState, t_end: float) -> Course:
     """Stay, or go to the phase's own place; slots may go on bent ways."""
-    rest = _stay_course(mission, phase, now, t_end)
+    rest = _rest_course(mission, phase, now, t_end)
     if not phase.has_bent_ways:
         return rest
     control, blend = np.array(phase.control_points), seconds(phase.blend)

@@ -225,10 +225,10 @@ class Roadmap:
         self.size = int(starts[-1])
         self.points = np.concatenate([x.points for row in self.lattices for x in row])
         self.layer_of = np.repeat(np.tile(np.arange(len(layers)), len(frames)), np.ravel(counts))
-        links = zip(*self._motion_links(), strict=True)
+        links = zip(*self._all_links(), strict=True)
         self.tails, self.heads, self.costs = map(np.concatenate, links)
 
-    def _motion_links(self) -> Iterator[tuple[Ints, Ints, Floats]]:
+    def _all_links(self) -> Iterator[tuple[Ints, Ints, Floats]]:
         """Nodes and costs of motions within layers, of changes at common places, of crossings from frame to frame."""
         space, radius, need = self.space, self.radius, self.need
         for f, row in enumerate(self.lattices):

@@ -23,7 +23,7 @@ from rigidfleet.preflight.findings import Preflight, Remark
 from rigidfleet.preflight.formations import SEARCHED, check_formations, formation_remarks
 from rigidfleet.preflight.gains import check_pid_gains, gain_remarks
 from rigidfleet.preflight.losses import loss_remarks
-from rigidfleet.preflight.margins import check_margins, margin_remarks
+from rigidfleet.preflight.margins import check_margins, loop_remarks
 from rigidfleet.preflight.network import check_network, network_remarks
 from rigidfleet.preflight.obstacles import boundary_remarks, obstacle_remarks
 from rigidfleet.preflight.offsets import steady_offset_remarks
@@ -72,7 +72,7 @@ def check(
         *(Remark("note", "files", text) for text in notes_on_files(mission.file_digests_text)),
         *formation_remarks(mission, formations),
         *gain_remarks(mission, preflight),
-        *margin_remarks(preflight),
+        *loop_remarks(preflight),
         *network_remarks(preflight),
         *trajectory.separation_remarks(mission, preflight),
         *trajectory.downwash_remarks(mission, preflight),

@@ -155,7 +155,7 @@ def _shape_key(r: Floats) -> bytes:
     return (np.round([*across / size**2, x[:, 2] / size], 3) + 0.0).tobytes()
 
 
-def margin_remarks(preflight: Preflight) -> Iterator[Remark]:
+def loop_remarks(preflight: Preflight) -> Iterator[Remark]:
     """Remarks on loops that lag and delay make unstable, or that have small margins."""
     if preflight.margins is None:
         return

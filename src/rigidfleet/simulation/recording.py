@@ -215,7 +215,7 @@ def assemble_result(
     later += [
         (LATER, partial(_slot_references, mission, [(p.time, p.followed) for p in pieces], tau)),
         (("singular_value",), partial(_singular_values, r, counts, [p.edges for p in pieces])),
-        (("mission_text",), partial(mission_text_entry, mission)),
+        (("mission_text",), partial(mission_text_field, mission)),
     ]
     return Result(
         time=time,
@@ -297,7 +297,7 @@ def _forces_and_references(
     }
 
 
-def mission_text_entry(mission: Mission) -> dict[str, str]:
+def mission_text_field(mission: Mission) -> dict[str, str]:
     """The text of a mission, as a result has it."""
     return {"mission_text": mission.text}
 

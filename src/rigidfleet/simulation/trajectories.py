@@ -37,7 +37,7 @@ from rigidfleet.result import Extremum, PhaseRecord, Result, presence
 from rigidfleet.result.result import CLOSE, VARIABLES
 from rigidfleet.setpoints import interval_starts_and_knots
 from rigidfleet.simulation.extremes import CurveWatch
-from rigidfleet.simulation.recording import closeness_arrays, mission_text_entry
+from rigidfleet.simulation.recording import closeness_arrays, mission_text_field
 from rigidfleet.typing import Floats, Ints
 
 #: Greatest distance [m] of a curve of fourth degree from the piece that it stands for, and most parts of a piece.
@@ -517,7 +517,7 @@ def result_of(
         statistics=statistics, **ending,
         later=[
             (CLOSE, partial(closeness_arrays, mission, worst, r, time, left)),
-            (("mission_text",), partial(mission_text_entry, mission)),
+            (("mission_text",), partial(mission_text_field, mission)),
         ],
     )  # fmt: skip
     # Its text is written where the result is, and need not be read.

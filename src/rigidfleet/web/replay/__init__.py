@@ -97,7 +97,7 @@ def replay(result: Result | str | Path, path: str | Path | None = None) -> Repla
 
 def replay_page(result: Result) -> str:
     """The page that `replay` writes."""
-    time, shown = _page_times(result), _drawn_edges(result)
+    time, shown = _even_times(result), _drawn_edges(result)
     most = float(np.nanmax(np.abs(result.multiplier[:, shown]), initial=0.0))
     scale = mean_weight(result.mission)
     tension = min(max(most, _IDLE * scale), _HEAVY * scale)
@@ -119,7 +119,7 @@ def replay_page(result: Result) -> str:
     return page(info, start="replay/replay.js", data=data)
 
 
-def _page_times(result: Result) -> Floats:
+def _even_times(result: Result) -> Floats:
     """Even times (K,) [s] from start to end, about as dense as the result if its samples are sparse."""
     first, last = float(result.time[0]), float(result.time[-1])
     gaps = np.diff(result.time)
