@@ -183,8 +183,7 @@ def command_rotors(k, i, flight, state):
     for q in range(3):
         F[q] = state.force[i, q]
     if vehicles.lost[i]:
-        for q in range(4):
-            command[q] = 0.0
+        command[:] = 0.0
         return False
     if vehicles.point[i]:
         size = math.sqrt(F[0] * F[0] + F[1] * F[1] + F[2] * F[2])

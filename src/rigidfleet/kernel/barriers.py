@@ -350,11 +350,8 @@ def solve_barriers(count, p, w, avoid):
 
     It begins with the pushes of the tick before.
     """
-    for i in range(avoid.b.shape[0]):
-        for q in range(3):
-            avoid.shift[i, q] = 0.0
-    for e in range(avoid.pull.shape[0]):
-        avoid.pull[e] = 0.0
+    avoid.shift[:] = 0.0
+    avoid.pull[:] = 0.0
     for k in range(count):
         if avoid.push[k] > 0.0:
             push_apart(avoid.rows[k, 0], avoid.rows[k, 1], avoid.normals[k], avoid.push[k], avoid)
@@ -386,11 +383,8 @@ def filter_accelerations(t, r, v, lost, p, w, avoid):
     n = avoid.b.shape[0]
     if violated:
         solve_barriers(count, p, w, avoid)
-    for i in range(n):
-        for q in range(3):
-            avoid.known[2, i, q] = 0.0
-    for k in range(avoid.last.shape[0]):
-        avoid.last[k] = 0.0
+    avoid.known[2] = 0.0
+    avoid.last[:] = 0.0
     for k in range(count if violated else 0):
         avoid.last[avoid.rows[k, 2]] = avoid.push[k]
         for side in range(2):

@@ -42,6 +42,7 @@ from rigidfleet.kernel.fleet import (
     speed_of,
     thrust_of,
 )
+from rigidfleet.kernel.linalg import copy
 from rigidfleet.kernel.mail import NONE, PULL, SATURATED, SLOT, TRACKED, A, R, U, V
 from rigidfleet.kernel.neighbours import (
     extrapolate_neighbour,
@@ -248,9 +249,7 @@ def evaluate_plan(t, p, w):
     if p.control.kind == TRACKING:
         local_law(t, p, w)
     else:
-        for i in range(w.f_u.shape[0]):
-            for q in range(3):
-                w.f_u[i, q] = p.control.force[i, q]
+        copy(p.control.force, w.f_u)
     distance_references(
         t, p.reference, p.graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot
     )
@@ -283,9 +282,7 @@ def prepare_messages(k, p, w, flight, state):
         post_clock(k, i, flight.clocks, state.tau[i], message)
         for q in range(mail.pull.shape[1]):
             message[PULL + q] = mail.pull[i, q]
-    for l in range(mail.multiplier.shape[0]):
-        for q in range(mail.multiplier.shape[1]):
-            mail.posted[row, l, q] = mail.multiplier[l, q]
+    copy(mail.multiplier, mail.posted[row])
 
 
 @jit
