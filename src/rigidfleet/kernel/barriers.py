@@ -29,7 +29,7 @@ from rigidfleet.kernel.avoidance import BARRIER, EXACT, KNOWN
 from rigidfleet.kernel.avoidance import needed_gap_acceleration as _needed_rate
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.constraint import find_multipliers
-from rigidfleet.kernel.linalg import cholesky, cholesky_solve
+from rigidfleet.kernel.linalg import cholesky, cholesky_solve, copy_vector
 from rigidfleet.kernel.moving import relative_braking_limit
 from rigidfleet.kernel.segments import obstacle_distance, segment_obstacle_distance
 
@@ -79,8 +79,7 @@ def add_barrier(count, i, j, entry, n, missing_accel, limit, avoid):
     """
     if count < avoid.rows.shape[0]:
         avoid.rows[count, 0], avoid.rows[count, 1], avoid.rows[count, 2] = i, j, entry
-        for q in range(3):
-            avoid.normals[count, q] = n[q]
+        copy_vector(n, avoid.normals[count])
         reduced = 1.0 / (avoid.inverse[i] + (avoid.inverse[j] if j >= 0 else 0.0))
         avoid.missing[count], avoid.most[count] = missing_accel, 2.0 * limit * reduced
         avoid.push[count], avoid.reduced[count] = min(avoid.last[entry], avoid.most[count]), reduced

@@ -3,7 +3,7 @@
 import math
 
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
-from rigidfleet.kernel.linalg import copy
+from rigidfleet.kernel.linalg import copy, copy_vector
 from rigidfleet.kernel.problem import BODY, SHAPE, TRACKING
 from rigidfleet.kernel.references import blend_slots, piece_at
 from rigidfleet.kernel.rigid_body import (
@@ -184,8 +184,7 @@ def body_gains(t, feedback, out):
     """Gains (4,) at t, from cubics through the table over the time to go; after arrival, the holding gains."""
     remaining = feedback.arrival - t
     if remaining < 0.0 or feedback.to_go.shape[0] == 0:
-        for q in range(4):
-            out[q] = feedback.hold[q]
+        copy_vector(feedback.hold, out)
         return
     low, since, _ = piece_at(remaining, feedback.to_go)
     h = feedback.to_go[low + 1] - feedback.to_go[low]

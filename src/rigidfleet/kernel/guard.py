@@ -33,7 +33,7 @@ from rigidfleet.kernel.barriers import filter_accelerations, limit_thrust, weake
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
 from rigidfleet.kernel.fleet import thrust_of
-from rigidfleet.kernel.linalg import copy
+from rigidfleet.kernel.linalg import copy, copy_vector
 from rigidfleet.kernel.moving import (
     braking_relative_to_obstacle,
     is_obstacle_known,
@@ -593,8 +593,7 @@ def correct_forces(p, w, flight, state, avoid):
         # Its choice counts for those that come after it, who keep their distances from it: the order makes the proof.
         how = 0 if free else choose_acceleration(i, r, v, avoid)
         if free:
-            for q in range(3):
-                avoid.chosen[i, q] = avoid.wanted[i, q]
+            copy_vector(avoid.wanted[i], avoid.chosen[i])
         if how > 0:
             count_action(GUARD, i, t, avoid)
             state.layers[i] |= ACTS[GUARD]
@@ -603,8 +602,7 @@ def correct_forces(p, w, flight, state, avoid):
             state.layers[i] |= ACTS[BRAKE]
         if avoid.soft[i] > 0.0:
             if how + state.layers[i] + avoid.overruled[i] == 0:
-                for q in range(3):
-                    avoid.commanded[i, q] = avoid.requested[i, q]
+                copy_vector(avoid.requested[i], avoid.commanded[i])
                 continue
             avoid.overruled[i] = 1
             if state.layers[i] == 0:

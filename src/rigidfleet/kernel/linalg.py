@@ -14,6 +14,13 @@ def copy(a, out):
 
 
 @jit
+def copy_vector(a, out):
+    """Copy a into out, both one-dimensional."""
+    for i in range(a.shape[0]):
+        out[i] = a[i]
+
+
+@jit
 def where_positive(x, a, b):
     """Return a if x > 0, else b."""
     return a if x > 0.0 else b

@@ -9,7 +9,7 @@ doi:10.1107/S0108767305015266).
 import math
 
 from rigidfleet.kernel.compiler.jit import jit, jit_exact
-from rigidfleet.kernel.linalg import copy, jacobi_eigen
+from rigidfleet.kernel.linalg import copy, copy_vector, jacobi_eigen
 from rigidfleet.kernel.rigid_body import (
     attitude_matrix,
     centre_of_mass,
@@ -71,8 +71,7 @@ def fit_quaternion(B, bound, K, V, w, q):
         length = cofactor_row(K, i, V[1])
         if length > most:
             most = length
-            for j in range(4):
-                q[j] = V[1, j]
+            copy_vector(V[1], q)
     if most > (_MULTIPLE * size * math.sqrt(size)) ** 2:
         scale = 1.0 / math.sqrt(most)
         for j in range(4):
@@ -156,8 +155,7 @@ def choose_quaternion_sign(q, last):
     if along < 0.0:
         for k in range(4):
             q[k] = -q[k]
-    for k in range(4):
-        last[k] = q[k]
+    copy_vector(q, last)
 
 
 @jit
@@ -371,8 +369,7 @@ def measure_samples(m):
                 line = m.line[k] = measure_slot_attitude(m, k, commanded, same, near, work, T)
                 copy(T, near)
             elif m.framed:
-                for a in range(4):
-                    m.attitude[k, a] = m.frame[k, a]
+                copy_vector(m.frame[k], m.attitude[k])
                 attitude_matrix(m.attitude[k], T)
             else:
                 m.attitude[k] = math.nan
@@ -381,8 +378,7 @@ def measure_samples(m):
                 quaternion_of(m.T_ref[k], m.attitude_reference[k])
                 choose_quaternion_sign(m.attitude_reference[k], last[1])
             if k == 0 or math.isnan(last[2, 0]):
-                for a in range(4):
-                    last[2, a] = m.frame[k, a]
+                copy_vector(m.frame[k], last[2])
             choose_quaternion_sign(m.frame[k], last[2])
             angular_momentum(m, k, mass, h)
             inertia(m.x[0], mass, zero, I)

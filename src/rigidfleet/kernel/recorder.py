@@ -5,7 +5,7 @@ import math
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.constraint import find_multipliers
 from rigidfleet.kernel.dynamics import closed_loop
-from rigidfleet.kernel.linalg import copy
+from rigidfleet.kernel.linalg import copy, copy_vector
 from rigidfleet.kernel.problem import BODY, OPEN, TRACKING
 from rigidfleet.kernel.references import blend_slots
 
@@ -46,8 +46,7 @@ def record_sample(t, p, w, k, out):
             copy(w.v_seen, out.v_seen[k])
         else:
             out.r_seen[k] = out.v_seen[k] = math.nan
-    for q in range(6):
-        out.wrench[k, q] = w.wrench[q]
+    copy_vector(w.wrench, out.wrench[k])
     # Even if only distances are blended, the slots give the formation's attitude.
     blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
     copy(w.p, out.p[k])
