@@ -9,6 +9,7 @@ import math
 
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.fleet import ATTITUDE, ROTORS, speed_of
+from rigidfleet.kernel.linalg import copy_vector
 from rigidfleet.kernel.rigid_body import attitude_matrix
 
 # Least vertical part of a force whose tilt is limited, as a share of the weight: a force downwards has no tilt to keep.
@@ -180,11 +181,9 @@ def command_rotors(k, i, flight, state):
     vehicles, commands, work = flight.vehicles, flight.commands, state.work
     command, S = state.command[i], state.S[i]
     F, tau, f = work.x[0], work.x[1], work.x[2]
-    for q in range(3):
-        F[q] = state.force[i, q]
+    copy_vector(state.force[i], F)
     if vehicles.lost[i]:
-        for q in range(4):
-            command[q] = 0.0
+        command[:] = 0.0
         return False
     if vehicles.point[i]:
         size = math.sqrt(F[0] * F[0] + F[1] * F[1] + F[2] * F[2])

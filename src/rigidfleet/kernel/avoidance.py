@@ -231,10 +231,8 @@ def for_next_phase(avoidance: AvoidanceArrays) -> AvoidanceArrays:
 
 def with_obstacles(avoidance: AvoidanceArrays, solids: Solids) -> AvoidanceArrays:
     """The same avoidance among other obstacles; the first of them are those before, and what is known of them stays."""
-    before, seen = (
-        avoidance.sight,
-        initial_sight(solids, avoidance.sight.reach, 0.0, avoidance.sight.swerve),
-    )
+    before = avoidance.sight
+    seen = initial_sight(solids, before.reach, 0.0, before.swerve)
     seen = seen._replace(noise=before.noise, normals=before.normals)
     for mine, old in zip(seen[-4:], before[-4:], strict=True):  # what is known
         mine[: len(old)] = old

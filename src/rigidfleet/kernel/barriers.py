@@ -29,7 +29,7 @@ from rigidfleet.kernel.avoidance import BARRIER, EXACT, KNOWN
 from rigidfleet.kernel.avoidance import needed_gap_acceleration as _needed_rate
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.constraint import find_multipliers
-from rigidfleet.kernel.linalg import cholesky, cholesky_solve
+from rigidfleet.kernel.linalg import cholesky, cholesky_solve, copy_vector
 from rigidfleet.kernel.moving import relative_braking_limit
 from rigidfleet.kernel.segments import obstacle_distance, segment_obstacle_distance
 
@@ -79,8 +79,7 @@ def add_barrier(count, i, j, entry, n, missing_accel, limit, avoid):
     """
     if count < avoid.rows.shape[0]:
         avoid.rows[count, 0], avoid.rows[count, 1], avoid.rows[count, 2] = i, j, entry
-        for q in range(3):
-            avoid.normals[count, q] = n[q]
+        copy_vector(n, avoid.normals[count])
         reduced = 1.0 / (avoid.inverse[i] + (avoid.inverse[j] if j >= 0 else 0.0))
         avoid.missing[count], avoid.most[count] = missing_accel, 2.0 * limit * reduced
         avoid.push[count], avoid.reduced[count] = min(avoid.last[entry], avoid.most[count]), reduced
@@ -350,11 +349,8 @@ def solve_barriers(count, p, w, avoid):
 
     It begins with the pushes of the tick before.
     """
-    for i in range(avoid.b.shape[0]):
-        for q in range(3):
-            avoid.shift[i, q] = 0.0
-    for e in range(avoid.pull.shape[0]):
-        avoid.pull[e] = 0.0
+    avoid.shift[:] = 0.0
+    avoid.pull[:] = 0.0
     for k in range(count):
         if avoid.push[k] > 0.0:
             push_apart(avoid.rows[k, 0], avoid.rows[k, 1], avoid.normals[k], avoid.push[k], avoid)
@@ -386,11 +382,8 @@ def filter_accelerations(t, r, v, lost, p, w, avoid):
     n = avoid.b.shape[0]
     if violated:
         solve_barriers(count, p, w, avoid)
-    for i in range(n):
-        for q in range(3):
-            avoid.known[2, i, q] = 0.0
-    for k in range(avoid.last.shape[0]):
-        avoid.last[k] = 0.0
+    avoid.known[2] = 0.0
+    avoid.last[:] = 0.0
     for k in range(count if violated else 0):
         avoid.last[avoid.rows[k, 2]] = avoid.push[k]
         for side in range(2):

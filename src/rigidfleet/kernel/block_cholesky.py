@@ -66,9 +66,7 @@ def list_factor_blocks(first, left, parent, mark, free, out):
 @jit
 def assemble(u, edges, m, mbar, mu, place, column, of_edge, L):
     """K = mbar J^T J + mu M into the blocks L (B, 9)."""
-    for q in range(L.shape[0]):
-        for s in range(9):
-            L[q, s] = 0.0
+    L[:] = 0.0
     for i in range(m.shape[0]):
         for s in range(3):
             L[column[place[i]], 4 * s] = mu * m[i]
@@ -235,9 +233,7 @@ def project_on_past_solutions(u, edges, m, mbar, mu, g, past, G, x):
     # agents are taken once for all products, so that ``past`` is read once.
     count = past.shape[0]
     c, scale = G[:, count], G[:, count + 1]
-    for p in range(count):
-        for q in range(count + 2):
-            G[p, q] = 0.0
+    G[:] = 0.0
     for k in range(edges.shape[0]):
         i, j = edges[k, 0], edges[k, 1]
         for p in range(count):

@@ -175,10 +175,6 @@ def drop_constraint_force(i, w, net, state):
     """Exert no constraint force as vehicle i; its integrals of constraints go on, as its neighbours' do."""
     mail = state.mail
     state.saturated[i] = True  # its own integral rests; steering says anew whether it is
-    for q in range(3):
-        w.f_C[i, q] = 0.0
-    for q in range(mail.pull.shape[1]):
-        mail.pull[i, q] = 0.0
+    w.f_C[i] = mail.pull[i] = 0.0
     for l in range(net.first[i], net.first[i + 1]):
-        for n in range(mail.multiplier.shape[1] - 1):
-            mail.multiplier[l, n] = 0.0
+        mail.multiplier[l, :-1] = 0.0

@@ -127,8 +127,7 @@ def solve_multipliers(vehicles, graph, law, w):
             cholesky_solve(w.A, y)
         return
     if law.solver in (ITERATED, EXACT):
-        for k in range(n):
-            y[k] = math.nan
+        y[:] = math.nan
         return
     solve_by_eigenvalues(graph, mbar, law, w)
 
@@ -140,8 +139,7 @@ def solve_by_eigenvalues(graph, mbar, law, w):
     b, y = w.b, w.multiplier
     assemble(w.u, graph, mbar, 0.0, w.A)
     largest = jacobi_eigen(w.A, w.V, w.w)
-    for k in range(n):
-        y[k] = 0.0
+    y[:] = 0.0
     for q in range(n):
         value = w.w[q]
         if law.solver == PINV:
@@ -183,14 +181,10 @@ def solve_at_agents(m, mbar, edges, law, w):
                     K[high + p, high + q] += block
                     K[low + p, low + q] += block
     cholesky(K)
-    for i in range(n):
-        for p in range(3):
-            a[i, p] = 0.0
-    for k in range(edges.shape[0]):
-        y[k] = 0.0
+    a[:] = 0.0
+    y[:] = 0.0
     for it in range(law.iterations + 1):
-        for p in range(3 * n):
-            x[p] = 0.0
+        x[: 3 * n] = 0.0
         for k in range(edges.shape[0]):
             i, j = edges[k, 0], edges[k, 1]
             rest = b[k]
@@ -222,8 +216,7 @@ def find_multipliers(graph):
 @jit
 def apply_multipliers(u, edges, multiplier, f_C):
     """f_C = J^T lambda, Eq. (10), into f_C (N, 3) [N]: no net force, no net torque."""
-    for i in range(f_C.shape[0]):
-        f_C[i, 0], f_C[i, 1], f_C[i, 2] = 0.0, 0.0, 0.0
+    f_C[:] = 0.0
     for k in range(edges.shape[0]):
         i, j = edges[k, 0], edges[k, 1]
         for q in range(3):

@@ -3,6 +3,7 @@
 import math
 
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
+from rigidfleet.kernel.linalg import copy, copy_vector
 from rigidfleet.kernel.problem import BODY, SHAPE, TRACKING
 from rigidfleet.kernel.references import blend_slots, piece_at
 from rigidfleet.kernel.rigid_body import (
@@ -159,8 +160,7 @@ def local_law(t, p, w):
     r, v, m, g, control = w.r, w.v, p.vehicles.m, p.vehicles.g, p.control
     reference_motion(t, p.motion, w)
     desired_agents(w)
-    for q in range(6):
-        w.wrench[q] = 0.0
+    w.wrench[:] = 0.0
     for i in range(r.shape[0]):
         for q in range(3):
             e = r[i, q] - w.r_ref[i, q]
@@ -184,8 +184,7 @@ def body_gains(t, feedback, out):
     """Gains (4,) at t, from cubics through the table over the time to go; after arrival, the holding gains."""
     remaining = feedback.arrival - t
     if remaining < 0.0 or feedback.to_go.shape[0] == 0:
-        for q in range(4):
-            out[q] = feedback.hold[q]
+        copy_vector(feedback.hold, out)
         return
     low, since, _ = piece_at(remaining, feedback.to_go)
     h = feedback.to_go[low + 1] - feedback.to_go[low]
@@ -259,8 +258,6 @@ def input_law(t, p, w):
             w.a, m, M, F, tau, w.cm[2], control.allocation, w.I, w.I_inv, w.f_u, w.H, w.H_V, w.H_w
         )
     else:
-        for i in range(m.shape[0]):
-            for q in range(3):
-                w.f_u[i, q] = control.force[i, q]
+        copy(control.force, w.f_u)
     if p.law.k_def > 0.0:
         damp_deformation(w.r, w.v, m, p.law.k_def, w.cm, w.f_u)

@@ -88,8 +88,7 @@ def restore_states_and_disturb(t, m, g, disturbance, w):
     if disturbance.gust.shape[0] > 0:
         spline_value(t, disturbance.gust_step, disturbance.gust, w.f_D)
     else:
-        for i in range(m.shape[0]):
-            w.f_D[i, 0], w.f_D[i, 1], w.f_D[i, 2] = 0.0, 0.0, 0.0
+        w.f_D[:] = 0.0
     for i in range(m.shape[0]):
         drag, true = disturbance.drag[i], disturbance.m[i]
         for q in range(3):

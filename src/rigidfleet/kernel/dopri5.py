@@ -52,9 +52,7 @@ _D = np.array(
 @jit
 def forget_stages(k, first):
     """Set the stages from ``first`` on to zero: NaN in them would survive a weight of zero."""
-    for s in range(first, 7):
-        for q in range(k.shape[1]):
-            k[s, q] = fill_lanes(0.0)
+    k[first:_STAGES] = fill_lanes(0.0)
 
 
 @jit_inline

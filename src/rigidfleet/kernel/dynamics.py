@@ -46,8 +46,7 @@ def closed_loop(t, y, dy, p, w):
     for i in range(n):
         w.f_E[i, 0], w.f_E[i, 1], w.f_E[i, 2] = 0.0, 0.0, -m[i] * g
     if p.external.address != 0:
-        for i in range(n):
-            w.a[i, 0], w.a[i, 1], w.a[i, 2] = 0.0, 0.0, 0.0
+        w.a[:] = 0.0
         call_external(p.external.address, t, r, v, w.a)
         for i in range(n):
             for s in range(3):

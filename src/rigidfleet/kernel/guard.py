@@ -33,13 +33,13 @@ from rigidfleet.kernel.barriers import filter_accelerations, limit_thrust, weake
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
 from rigidfleet.kernel.fleet import thrust_of
+from rigidfleet.kernel.linalg import copy, copy_vector
 from rigidfleet.kernel.moving import (
     braking_relative_to_obstacle,
     is_obstacle_known,
     miss_distance,
     moving_obstacle_margin,
     relative_braking_limit,
-    required_obstacle_distance,
     steer_round_obstacles,
     update_tracks,
     way_to_rest,
@@ -227,8 +227,7 @@ def list_neighbours(r, lost, way, avoid):
             order[at] = order[at - 1]
             at -= 1
         order[at] = i
-    for i in range(n + 1):
-        avoid.start[i] = 0
+    avoid.start[:] = 0
     # First to count, so that each list begins where the one before ends; then to write.
     for fill in range(2):
         for k in range(n):
@@ -298,9 +297,7 @@ def update_neighbours(r, v, lost, avoid):
     speed, hard = (1.0 + _FASTER) * fastest + _LEAST_SPEED, (1.0 + _FASTER) * hardest + 1.0
     way = interaction_range(speed, hard, avoid)
     avoid.span[0], avoid.span[1], avoid.span[2] = max(_NEARER * way, _LEAST_WAY), speed, hard
-    for i in range(avoid.b.shape[0]):
-        for q in range(3):
-            avoid.listed[i, q] = r[i, q]
+    copy(r, avoid.listed)
     avoid.count[LISTED], avoid.last[:] = 1, 0.0
     return list_neighbours(r, lost, way + avoid.span[0], avoid)
 
@@ -334,10 +331,8 @@ def set_obstacle_distance_to_keep(t, i, o, r, v, closest, avoid):
     if not is_obstacle_known(o, avoid):
         return closest
     stop, speed = write_stop_relative_to_obstacle(i, o, r, v, avoid)
-    need, way = (
-        required_obstacle_distance(i, o, speed, relative_braking_limit(i, o, avoid), avoid),
-        avoid.shifted,
-    )
+    way, bound, braking = avoid.shifted, avoid.sight.bound[o], relative_braking_limit(i, o, avoid)
+    need = avoid.reach[i] + avoid.spare[i] + bound[0] + bound[1] * speed / braking
     apart = obstacle_distance(way[0, 0], way[0, 1], way[0, 2], o, avoid.solids, avoid.normal) - stop
     avoid.walls[i, o] = need
     if avoid.threat[i] < 0:  # also one that is still far: a single tick may bring it near
@@ -598,8 +593,7 @@ def correct_forces(p, w, flight, state, avoid):
         # Its choice counts for those that come after it, who keep their distances from it: the order makes the proof.
         how = 0 if free else choose_acceleration(i, r, v, avoid)
         if free:
-            for q in range(3):
-                avoid.chosen[i, q] = avoid.wanted[i, q]
+            copy_vector(avoid.wanted[i], avoid.chosen[i])
         if how > 0:
             count_action(GUARD, i, t, avoid)
             state.layers[i] |= ACTS[GUARD]
@@ -608,8 +602,7 @@ def correct_forces(p, w, flight, state, avoid):
             state.layers[i] |= ACTS[BRAKE]
         if avoid.soft[i] > 0.0:
             if how + state.layers[i] + avoid.overruled[i] == 0:
-                for q in range(3):
-                    avoid.commanded[i, q] = avoid.requested[i, q]
+                copy_vector(avoid.requested[i], avoid.commanded[i])
                 continue
             avoid.overruled[i] = 1
             if state.layers[i] == 0:

@@ -6,6 +6,21 @@ from rigidfleet.kernel.compiler.jit import jit
 
 
 @jit
+def copy(a, out):
+    """Copy a into out, both two-dimensional."""
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            out[i, j] = a[i, j]
+
+
+@jit
+def copy_vector(a, out):
+    """Copy a into out, both one-dimensional."""
+    for i in range(a.shape[0]):
+        out[i] = a[i]
+
+
+@jit
 def where_positive(x, a, b):
     """Return a if x > 0, else b."""
     return a if x > 0.0 else b

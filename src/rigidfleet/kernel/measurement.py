@@ -9,7 +9,7 @@ doi:10.1107/S0108767305015266).
 import math
 
 from rigidfleet.kernel.compiler.jit import jit, jit_exact
-from rigidfleet.kernel.linalg import jacobi_eigen
+from rigidfleet.kernel.linalg import copy, copy_vector, jacobi_eigen
 from rigidfleet.kernel.rigid_body import (
     attitude_matrix,
     centre_of_mass,
@@ -71,8 +71,7 @@ def fit_quaternion(B, bound, K, V, w, q):
         length = cofactor_row(K, i, V[1])
         if length > most:
             most = length
-            for j in range(4):
-                q[j] = V[1, j]
+            copy_vector(V[1], q)
     if most > (_MULTIPLE * size * math.sqrt(size)) ** 2:
         scale = 1.0 / math.sqrt(most)
         for j in range(4):
@@ -156,8 +155,7 @@ def choose_quaternion_sign(q, last):
     if along < 0.0:
         for k in range(4):
             q[k] = -q[k]
-    for k in range(4):
-        last[k] = q[k]
+    copy_vector(q, last)
 
 
 @jit
@@ -196,8 +194,7 @@ def width_length_and_axis(p, mass, C, V, w, axis):
 @jit
 def attitude_of_line(x, p, mass, axis, near, T, now, there, across):
     """Attitude T (3, 3) of a line: ``near``, followed by the smallest rotation that lays its axis along the agents."""
-    for a in range(3):
-        there[a] = 0.0
+    there[:] = 0.0
     for i in range(x.shape[0]):
         along = p[i, 0] * axis[0] + p[i, 1] * axis[1] + p[i, 2] * axis[2]
         along = along if mass[i] > 0.0 else 0.0  # agents that are lost do not count
@@ -205,9 +202,7 @@ def attitude_of_line(x, p, mass, axis, near, T, now, there, across):
             there[a] += along * x[i, a]
     length = math.sqrt(there[0] ** 2 + there[1] ** 2 + there[2] ** 2)
     if length == 0.0:
-        for a in range(3):
-            for b in range(3):
-                T[a, b] = near[a, b]
+        copy(near, T)
         return
     multiply_transposed(near, axis, now)
     close = square = 0.0  # 1 + c with the cosine c of the angle, accurate up to half a turn
@@ -252,9 +247,7 @@ def inertia_inverse_of_line(I, lifted, axis, out):
     second -= I[0, 1] * I[0, 1] + I[0, 2] * I[0, 2] + I[1, 2] * I[1, 2]
     third = eigenvector_of_value(I, 0.0, axis)
     if not second > 0.0:
-        for a in range(3):
-            for b in range(3):
-                out[a, b] = 0.0
+        out[:] = 0.0
         return
     # det (I - x) = -x^3 + first x^2 - second x + third: Newton's method, from below all roots.
     x = 0.0
@@ -347,9 +340,7 @@ def measure_samples(m):
     T, near, last = work[4], work[5], work[6]
     centre, zero = work[7, 2], work[7, 3]
     I, inverse, h, omega = work[0], work[1], work[3, 0], work[3, 1]
-    for a in range(4):
-        for b in range(4):
-            last[a, b] = 0.0
+    last[:] = 0.0
     last[0, 0] = last[1, 0] = 1.0
     mass = m.left
     for piece in range(m.attached.shape[0]):
@@ -374,27 +365,20 @@ def measure_samples(m):
                     for a in range(3):
                         m.x[1, i, a] = m.p[k, i, a] - centre[a]
                 if commanded:
-                    for a in range(3):
-                        for b in range(3):
-                            near[a, b] = m.T_ref[k, a, b]
+                    copy(m.T_ref[k], near)
                 line = m.line[k] = measure_slot_attitude(m, k, commanded, same, near, work, T)
-                for a in range(3):
-                    for b in range(3):
-                        near[a, b] = T[a, b]
+                copy(T, near)
             elif m.framed:
-                for a in range(4):
-                    m.attitude[k, a] = m.frame[k, a]
+                copy_vector(m.frame[k], m.attitude[k])
                 attitude_matrix(m.attitude[k], T)
             else:
-                for a in range(4):
-                    m.attitude[k, a] = math.nan
+                m.attitude[k] = math.nan
             choose_quaternion_sign(m.attitude[k], last[0])
             if not math.isnan(m.T_ref[k, 0, 0]):
                 quaternion_of(m.T_ref[k], m.attitude_reference[k])
                 choose_quaternion_sign(m.attitude_reference[k], last[1])
             if k == 0 or math.isnan(last[2, 0]):
-                for a in range(4):
-                    last[2, a] = m.frame[k, a]
+                copy_vector(m.frame[k], last[2])
             choose_quaternion_sign(m.frame[k], last[2])
             angular_momentum(m, k, mass, h)
             inertia(m.x[0], mass, zero, I)
@@ -406,8 +390,7 @@ def measure_samples(m):
             if left < 2:
                 omega[0] = omega[1] = omega[2] = 0.0
             if math.isnan(m.attitude[k, 0]):
-                for a in range(3):
-                    m.rates[k, a] = math.nan
+                m.rates[k] = math.nan
             else:
                 multiply(T, omega, m.rates[k])
                 if left < n:
@@ -437,8 +420,7 @@ def measure_cm_and_wrench(m, k, mass, M):
     n = r.shape[0]
     centre_of_mass(r, mass, M, m.cm[k])
     centre_of_mass(v, mass, M, m.cm_velocity[k])
-    for a in range(6):
-        m.wrench[k, a] = 0.0
+    m.wrench[k] = 0.0
     for i in range(n):
         for a in range(3):
             m.x[0, i, a] = r[i, a] - m.cm[k, a]

@@ -181,13 +181,6 @@ def way_to_rest(u, b, lag, period):
 
 
 @jit
-def required_obstacle_distance(i, o, speed, braking, avoid):
-    """Distance [m] from obstacle o, which moves, to keep by the stop segment of vehicle i at a relative speed."""
-    bound = avoid.sight.bound[o]
-    return avoid.reach[i] + avoid.spare[i] + bound[0] + bound[1] * speed / braking
-
-
-@jit
 def write_stop_relative_to_obstacle(i, o, r, v, avoid):
     """Write the relative stop segment of vehicle i to ``shifted`` 0 and 2; returns its length and relative speed."""
     x, out = avoid.sight.track[o], avoid.shifted

@@ -152,8 +152,7 @@ def solve_own_constraint_force(i, k, dt, tick, p, w, net, mail, saturated):
         if mail.grip[l] > 0.0:
             equation_of_edge(d, l, k, dt, tick, p, w, net, mail, saturated)
             d += 1
-    for q in range(3):
-        w.f_C[i, q] = 0.0
+    w.f_C[i] = 0.0
     for a in range(d):
         j = net.links[int(rows[a, _LINK]), 1]
         for b in range(a):
@@ -180,8 +179,7 @@ def solve_own_constraint_force(i, k, dt, tick, p, w, net, mail, saturated):
             before = rows[a, _UNKNOWN] if n > 0 else 0.0
             rows[a, _UNKNOWN] = mbar * (rows[a, _RIGHT] + rest) + mu * before
         cholesky_solve(matrix[:d, :d], rows[:d, _UNKNOWN])
-        for q in range(3):
-            mail.pull[i, 3 * n + q] = 0.0
+        mail.pull[i, 3 * n : 3 * n + 3] = 0.0
         for a in range(d):
             l = int(rows[a, _LINK])
             mail.multiplier[l, n] = rows[a, _UNKNOWN]

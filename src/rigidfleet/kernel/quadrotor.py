@@ -29,8 +29,7 @@ def point_derivative(y, command, i, vehicles, air, push, dy):
         force = command[q] + push[q] + vehicles.drag[i, q] * (air[q] - y[3 + q])
         dy[q], dy[3 + q] = y[3 + q], force / m
     dy[5] -= vehicles.g
-    for q in range(6, 17):
-        dy[q] = 0.0
+    dy[6:] = 0.0
 
 
 @jit

@@ -5,24 +5,9 @@ import math
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.constraint import find_multipliers
 from rigidfleet.kernel.dynamics import closed_loop
+from rigidfleet.kernel.linalg import copy, copy_vector
 from rigidfleet.kernel.problem import BODY, OPEN, TRACKING
 from rigidfleet.kernel.references import blend_slots
-
-
-@jit
-def copy(a, out):
-    """Copy a into out, both two-dimensional."""
-    for i in range(a.shape[0]):
-        for j in range(a.shape[1]):
-            out[i, j] = a[i, j]
-
-
-@jit
-def fill_with_nan(out):
-    """Write NaN into a two-dimensional array."""
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[i, j] = math.nan
 
 
 @jit
@@ -55,20 +40,18 @@ def record_sample(t, p, w, k, out):
         if p.disturbance.active:
             copy(w.f_D, out.f_D[k])
         else:
-            fill_with_nan(out.f_D[k])
+            out.f_D[k] = math.nan
         if p.disturbance.noise_r.shape[0] > 0:
             copy(w.r_seen, out.r_seen[k])
             copy(w.v_seen, out.v_seen[k])
         else:
-            fill_with_nan(out.r_seen[k])
-            fill_with_nan(out.v_seen[k])
-    for q in range(6):
-        out.wrench[k, q] = w.wrench[q]
+            out.r_seen[k] = out.v_seen[k] = math.nan
+    copy_vector(w.wrench, out.wrench[k])
     # Even if only distances are blended, the slots give the formation's attitude.
     blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
     copy(w.p, out.p[k])
     if kind == OPEN:
-        fill_with_nan(out.T_ref[k])
+        out.T_ref[k] = math.nan
     else:
         copy(w.T_ref, out.T_ref[k])
     if kind == TRACKING:
@@ -77,9 +60,7 @@ def record_sample(t, p, w, k, out):
             out.motion[k, q], out.motion[k, 3 + q] = w.body[0, q], w.body[1, q]
             out.rates[k, q] = w.body[3, q]
         return
-    fill_with_nan(out.r_ref[k])
-    for q in range(3):
-        out.motion[k, q] = out.motion[k, 3 + q] = out.rates[k, q] = math.nan
+    out.r_ref[k] = out.motion[k] = out.rates[k] = math.nan
     if kind == BODY:
         since = t - p.feedback.arrival
         for q in range(3):

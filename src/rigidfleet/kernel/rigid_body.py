@@ -234,8 +234,7 @@ def allocate_pinv(x, m, M, F, tau, split, I, I_inv, f, H, V, work):
             for p in range(3):
                 H[3 * i + q, 3 * i + p] -= x[i, q] * x[i, p]
     largest = jacobi_eigen(H, V, values)
-    for k in range(3 * n):
-        f[k // 3, k % 3] = 0.0
+    f[:] = 0.0
     for q in range(3 * n):
         if values[q] > 1e-12 * largest:
             s = 0.0

@@ -42,6 +42,7 @@ from rigidfleet.kernel.fleet import (
     speed_of,
     thrust_of,
 )
+from rigidfleet.kernel.linalg import copy, copy_vector
 from rigidfleet.kernel.mail import NONE, PULL, SATURATED, SLOT, TRACKED, A, R, U, V
 from rigidfleet.kernel.neighbours import (
     extrapolate_neighbour,
@@ -248,9 +249,7 @@ def evaluate_plan(t, p, w):
     if p.control.kind == TRACKING:
         local_law(t, p, w)
     else:
-        for i in range(w.f_u.shape[0]):
-            for q in range(3):
-                w.f_u[i, q] = p.control.force[i, q]
+        copy(p.control.force, w.f_u)
     distance_references(
         t, p.reference, p.graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot
     )
@@ -283,9 +282,7 @@ def prepare_messages(k, p, w, flight, state):
         post_clock(k, i, flight.clocks, state.tau[i], message)
         for q in range(mail.pull.shape[1]):
             message[PULL + q] = mail.pull[i, q]
-    for l in range(mail.multiplier.shape[0]):
-        for q in range(mail.multiplier.shape[1]):
-            mail.posted[row, l, q] = mail.multiplier[l, q]
+    copy(mail.multiplier, mail.posted[row])
 
 
 @jit
@@ -310,8 +307,7 @@ def decide_broadcasts(k, p, w, flight, state):
         mail.silent[j] = quiet or is_well_predicted(j, k, p, w, flight, mail)
         if not mail.silent[j]:
             mail.said[j] = k
-            for q in range(mail.last.shape[1]):
-                mail.last[j, q] = mail.post[k % mail.due.shape[1], j, q]
+            copy_vector(mail.post[k % mail.due.shape[1], j], mail.last[j])
 
 
 @jit
@@ -332,8 +328,7 @@ def find_desired_forces(k, t, p, w, flight, state, call):
                 w.r[i, q], w.v[i, q] = state.S[i, q], state.S[i, 3 + q]
         mean_axes(w.r, w.v, p.vehicles.m, p.vehicles.M, w)
         multiply(w.T, w.cm[2], w.cm[4])
-        for q in range(4):
-            state.frame[2, q] = state.frame[1, q]
+        copy_vector(state.frame[1], state.frame[2])
         quaternion_rate(state.frame[0], w.cm[4], state.frame[1])
     state.clock[LAW_TIME] = t
     state.count[LAWS] += 1
@@ -444,8 +439,7 @@ def write_samples(t, h, p, flight, state, call):
         for i in range(state.S.shape[0]):
             for q in range(17):
                 call.S[c, i, q] = work.y[6, 17 * i + q]
-            for q in range(4):
-                call.command[c, i, q] = state.command[i, q]
+            copy_vector(state.command[i], call.command[c, i])
             for q in range(3):
                 call.f_u[c, i, q], call.f_C[c, i, q] = state.f_u[i, q], state.f_C[i, q]
             for q in range(6):
@@ -458,15 +452,13 @@ def write_samples(t, h, p, flight, state, call):
             call.tau[c, i, 0] = state.tau[i, OFF] + since * (state.tau[i, RATE] - 1.0)
             call.tau[c, i, 1], call.tau[c, i, 2] = state.tau[i, RATE], state.tau[i, SLOPE]
         write_derivatives(c, t + x, p, flight, state, call)
-        for k in range(state.integral.shape[0]):
-            call.integral[c, k] = state.integral[k]
+        copy_vector(state.integral, call.integral[c])
         for q in range(4):
             call.frame[c, q] = (
                 state.frame[0, q] + (t + x - state.clock[LAW_TIME]) * state.frame[1, q]
             )
         normalise_quaternion(call.frame[c])
-        for l in range(call.stamp.shape[1]):
-            call.stamp[c, l] = state.mail.stamp[l]
+        copy_vector(state.mail.stamp, call.stamp[c])
         count[SAMPLES] = c + 1
 
 

@@ -90,30 +90,23 @@ class LargeSolver:
         # Not needed as long as elimination succeeds
         self.pattern: Pattern | None = None
         self.pulled = True  # whether the workspace has the multipliers of the last evaluation
-        self._calls = [_c_callback(method) for method in (self._try_solve, self._try_multipliers)]
+        computed = LargeSolver.solve, LargeSolver.find_multipliers
+        self._calls = [_c_callback(self, compute) for compute in computed]
         self.address, self.multipliers = (
             int(ctypes.cast(call, ctypes.c_void_p).value or 0) for call in self._calls
         )
         if self.setup.elimination is None:
             self.multipliers = 0
 
-    def _try_solve(self) -> None:
-        # An exception cannot pass through compiled code; the forces become NaN.
+    def try_to(self, compute: Callable[[LargeSolver], None]) -> None:
+        """Compute for the kernel: an exception cannot pass through compiled code, so the forces become NaN."""
         try:
             if self.error is None:
-                self.counts.evaluations += 1
-                self.solve()
+                compute(self)
                 return
         except BaseException as error:
             self.error = error
         self._fill_results_with_nan()
-
-    def _try_multipliers(self) -> None:
-        try:
-            self.find_multipliers()
-        except BaseException as error:
-            self.error = error
-            self._fill_results_with_nan()
 
     def _fill_results_with_nan(self) -> None:
         self.workspace.multiplier[:] = self.workspace.f_C[:] = math.nan
@@ -135,6 +128,7 @@ class LargeSolver:
     def solve(self) -> None:
         """Solve for the forces or multipliers of ``workspace.b``; NaN if there is no solution."""
         w, vehicles, order = self.workspace, self.vehicles, self.setup.elimination
+        self.counts.evaluations += 1
         if order is not None:
             pivot = call_large(
                 "solve", w.u, w.b, w.r, vehicles.m, vehicles.M, order, self.setup.axes, w.cm[0], w.I, w.I_inv, self.a,
@@ -278,14 +272,13 @@ class LargeSolver:
             mu = max(10.0 * mu, 1e-3)
 
 
-def _c_callback(method: Callable[[], None]) -> Any:
-    """A C function that calls a method. It does not keep the object alive, so that nothing but its users does."""
-    reference = weakref.WeakMethod(method)
+def _c_callback(solver: LargeSolver, compute: Callable[[LargeSolver], None]) -> Any:
+    """A C function that has a solver compute. It does not keep it alive, so that nothing but its users does."""
+    reference = weakref.ref(solver)
 
     def call() -> None:
-        bound = reference()
-        if bound is not None:
-            bound()
+        if (alive := reference()) is not None:
+            alive.try_to(compute)
 
     return ctypes.CFUNCTYPE(None)(call)
 
