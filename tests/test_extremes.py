@@ -231,6 +231,36 @@ def test_constraint_forces_next_to_nothing_are_not_searched(monkeypatch):
     assert quiet > 8
 
 
+def test_small_forces_on_long_steps_are_found():
+    """Where a long step's parabola promises less than the force rises, its peak is still told to 1e-9 of the thrust."""
+    phases = [
+        {
+            "kind": "establish",
+            "formation": "pair",
+            "until": 0.54,
+            "blend": 0.216,
+            "control": "tracking",
+        }
+    ]
+    mission = Mission.from_dict(
+        {
+            "schema_version": 1,
+            "name": "pair",
+            "agents": {
+                "mass": [0.56, 0.88],
+                "position": [[1.36, -1.4, 11.83], [-4.33, 2.43, 12.8]],
+            },
+            "formations": {"pair": {"slots": [[-2.44, 1.89, 3.72], [1.11, 0.91, 2.45]]}},
+            "phases": phases,
+            "constraint": {"deformation_damping": 0.0},
+        }
+    )
+    extremes = simulate(mission).phases[0].extremes
+    fine = np.abs(simulate(mission, times=np.linspace(0.0, 0.54, 5000)[:-1]).multiplier).max()
+    assert fine < 1e-5
+    assert abs(extremes["tension"].value) >= fine - 1e-9 * extremes["thrust"].value
+
+
 @pytest.mark.parametrize("step", [0.05, 1.0])
 def test_a_thrust_limit_is_held_between_samples(step):
     """A limit between the greatest thrust and that of the samples is passed."""

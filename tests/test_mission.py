@@ -24,6 +24,7 @@ from rigidfleet.mission import (
     mission_text,
 )
 from rigidfleet.mission.obstacles import Box
+from rigidfleet.simulation.flight import simulate
 
 SHIPPED = [
     "bridge-inspection",
@@ -457,6 +458,22 @@ def test_missions_cross_processes():
     again = pickle.loads(pickle.dumps(mission))
     assert again == mission
     assert again.text == mission.text
+
+
+def test_a_copy_has_nothing_that_follows_from_what_is_changed():
+    """A copy of a mission that has flown is flown with its own gusts, masses and roofs."""
+    mission = load_mission("windy-passage")
+    first, data = simulate(mission).position, mission.to_dict()
+    data["disturbances"]["gusts"]["seed"] = 9
+    assert (mission.roofs.kind.size, mission.fleet.mass[0]) == (5, 1.0)
+    other = Mission.from_dict(data).disturbances
+    heavy = mission.agents.model_copy(update={"mass": (2.0, 2.0, 2.0)})
+    roof = Box.model_validate({"kind": "box", "name": "roof", "min": [0, 0, 0], "max": [1, 1, 1]})
+    copies = {"disturbances": other, "agents": heavy, "obstacles": (roof,)}
+    gusty, loaded, roofed = (mission.model_copy(update={k: x}) for k, x in copies.items())
+    assert not np.array_equal(simulate(gusty).position, first)
+    assert (loaded.fleet.mass[0], roofed.roofs.kind.size) == (2.0, 1)
+    assert np.array_equal(simulate(mission.model_copy()).position, first)
 
 
 # -- what is found

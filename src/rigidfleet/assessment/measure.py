@@ -327,15 +327,15 @@ class Measurements:
     def axis_errors_at_end(self) -> dict[int, float | None]:
         """Angle [deg] of a line or plane from its intended direction at the end of each phase that has one."""
         flips, result = {}, self.result
+        flat = {index: fit for index, fit in self.fits_at_end.items() if fit.dimension < 3}
+        last = [self.parts[index].stop - 1 for index in flat]
         # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
-        q = np.array([x[self.last] for x in (result.attitude_reference, result.frame)])
-        turns = dict(zip(self.flown, att.dcm_from_quaternion(q).swapaxes(0, 1), strict=True))
-        for index, fit in self.fits_at_end.items():
-            if fit.dimension == 3:
-                continue
+        q = np.array([x[last] for x in (result.attitude_reference, result.frame)])
+        turns = att.dcm_from_quaternion(q).swapaxes(0, 1)
+        for (index, fit), turn in zip(flat.items(), turns, strict=True):
             # Only tracked slots steer a line; otherwise its direction follows from the shape before.
             steers = 2 if fit.dimension == 2 else result.phases[index].control == "tracking"
-            aims = (fit.axis @ turns[index][:steers]).tolist()
+            aims = (fit.axis @ turn[:steers]).tolist()
             angles = (degrees_between(fit.turned_axis, aim) for aim in aims)
             flips[index] = next(filter(math.isfinite, angles), None)
         return flips

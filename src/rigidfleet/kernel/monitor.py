@@ -69,7 +69,7 @@ from rigidfleet.solids.distance import STEEP, box_normal
 
 #: Relative accuracy of a greatest force, direct and iterated; that of constraint forces and tensions next to nothing,
 #: as a share of the greatest thrust, and of such constraint errors [m].
-_CLOSE_FORCE, _CLOSE_ITERATED, _CLOSE_SMALL = 1e-7, 1e-6, 1e-10
+_CLOSE_FORCE, _CLOSE_ITERATED, _CLOSE_SMALL = 1e-7, 1e-6, 1e-12
 #: Greatest rotation of one piece of a step in the body formulation [rad].
 _TURN = 0.1
 #: Least interval in which a peak of forces is searched, as a share of the whole interval.

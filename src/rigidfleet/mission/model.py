@@ -389,6 +389,13 @@ class Mission(Contents, Shown):
     def _made(self) -> dict[tuple[Any, ...], Any]:
         return {}
 
+    def __copy__(self) -> Self:
+        """A copy without what was made of the mission: `model_copy` may change what that follows from."""
+        copied = super().__copy__()
+        for name in copied.__dict__.keys() - self.__class__.model_fields.keys():
+            del copied.__dict__[name]
+        return copied
+
     def __getstate__(self) -> dict[Any, Any]:
         """What is pickled: not what was made of it, which may hold functions."""
         state = super().__getstate__()
