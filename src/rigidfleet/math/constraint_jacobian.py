@@ -31,8 +31,7 @@ def _unit_vectors(p: Floats, i: Ints, j: Ints) -> Floats:
     """u_ij (..., m, d) from agents j (m,) to i (m,) at p (..., N, d), not finite where they are at the same place."""
     u = p.take(i, axis=-2) - p.take(j, axis=-2)
     with np.errstate(divide="ignore", invalid="ignore"):
-        u /= np.sqrt(np.add.reduce(u * u, axis=-1, keepdims=True))
-    return u
+        return u / np.sqrt(np.add.reduce(u * u, axis=-1, keepdims=True))
 
 
 def filter_factors(
