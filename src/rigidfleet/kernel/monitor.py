@@ -35,6 +35,7 @@ from rigidfleet.kernel.bernstein import (
 )
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.gauge import write_watched_forces
+from rigidfleet.kernel.linalg import copy_vector
 from rigidfleet.kernel.outside import call_recorder
 from rigidfleet.kernel.records import (
     ACCELERATION,
@@ -268,12 +269,8 @@ def enclose_agents(points, monitor):
     """Balls about the agents' middle control points that hold their positions over a step."""
     for i in range(monitor.balls.shape[0]):
         curve, ball = points[:, 3 * i : 3 * i + 3], monitor.balls[i]
-        ball[0], ball[1], ball[2], ball[3] = (
-            curve[2, 0],
-            curve[2, 1],
-            curve[2, 2],
-            ball_radius(curve),
-        )
+        copy_vector(curve[2], ball)
+        ball[3] = ball_radius(curve)
 
 
 @jit

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from copy import copy
 from functools import cached_property, lru_cache, wraps
 from hashlib import sha256
 from typing import Any, Literal, NamedTuple, Self, TypeVar
@@ -397,10 +398,8 @@ class Mission(Contents, Shown):
         return copied
 
     def __getstate__(self) -> dict[Any, Any]:
-        """What is pickled: not what was made of it, which may hold functions."""
-        state = super().__getstate__()
-        own = {key: x for key, x in state["__dict__"].items() if key != "_made"}
-        return state | {"__dict__": own}
+        """What is pickled: what a copy has, as what was made of the mission may hold functions."""
+        return super(Mission, copy(self)).__getstate__()
 
     @_compute_once
     def _slots_in_own_order(self, name: str) -> Floats | None:

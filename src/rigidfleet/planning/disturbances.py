@@ -24,14 +24,10 @@ NOTHING = 1e-20
 
 def mission_disturbance(mission: Mission) -> Disturbance:
     """Disturbances of a mission from its start to its latest end, with no vehicle lost yet."""
-    out = part_of_mission(mission, _disturbance_without_ground)
-    if not out.active:
-        return out
-    return out._replace(floor=mission.ground + mission.fleet.radius, roofs=mission.roofs)
+    return part_of_mission(mission, _draw_disturbance)  # random numbers take long to draw
 
 
-def _disturbance_without_ground(mission: Mission) -> Disturbance:
-    """What does not depend on obstacles, which may be replaced in flight: random numbers take long to draw."""
+def _draw_disturbance(mission: Mission) -> Disturbance:
     d = mission.disturbances
     none = no_disturbance(mission.fleet.mass.copy())
     if d is None:
@@ -43,7 +39,9 @@ def _disturbance_without_ground(mission: Mission) -> Disturbance:
         inverse=1.0 / mission.true_mass,
         drag=mission.drag,
         wind=wind,
+        floor=mission.ground + mission.fleet.radius,
         radius=mission.fleet.radius,
+        roofs=mission.roofs,
     )
     if d.gusts is not None:
         step = knot_spacing(d.gusts, float(np.linalg.norm(wind)))
