@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from rigidfleet.errors import MissionError
 from rigidfleet.formation import distance_geometry, graphs, point_files, shapes
 from rigidfleet.math import rigid_body
-from rigidfleet.planning.solvers import elimination_steps
+from rigidfleet.planning.solvers import henneberg_steps
 from rigidfleet.rigidity import jacobian, spectrum
 
 NAMED = [
@@ -447,7 +447,7 @@ def test_trees_are_minimally_rigid(n):
     assert len(np.unique(edges, axis=0)) == 3 * n - 6
     assert (edges[:, 0] < edges[:, 1]).all()
     assert np.linalg.matrix_rank(jacobian(p, edges)) == 3 * n - 6
-    steps = elimination_steps(n, edges)
+    steps = henneberg_steps(n, edges)
     assert steps is not None
     depth = np.zeros(n, dtype=int)
     for i, *mine in steps.tolist():

@@ -47,8 +47,8 @@ def solver_of(p, edges, masses, law, *, eliminated=False, tolerance=1e-13) -> La
     work.u[:] = directions(p, edges)
     order = None
     if eliminated:
-        steps = solvers.elimination_steps(len(p), edges)
-        order = None if steps is None else ordering.pivot_order(steps, edges)
+        steps = solvers.henneberg_steps(len(p), edges)
+        order = None if steps is None else ordering.order_of_steps(steps, edges)
     setup = Setup(order, cache(partial(solvers.agent_dissection_order, p, edges)), tolerance)
     return LargeSolver(vehicles, edges.astype(np.uint32), law, work, setup)
 
@@ -232,7 +232,7 @@ def test_a_lost_pivot_falls_back_and_is_counted(rng):
     """Where an agent lies in a plane with its three, elimination has no pivot; the vertex graph goes on."""
     p = lattice(3)
     edges = graphs.henneberg(p)
-    steps = solvers.elimination_steps(27, edges)
+    steps = solvers.henneberg_steps(27, edges)
     assert steps is not None
     i, mine = steps[-1, 0], steps[-1, 1:]
     a, b, c = (int(x) for x in edges[mine].sum(axis=1) - i)
@@ -290,7 +290,7 @@ def test_order_of_the_sweep_is_found_whatever_the_numbers(rng):
     edges = graphs.henneberg(p)
     for order in (np.arange(125), rng.permutation(125)):
         renamed = np.sort(order[edges], axis=1)
-        steps = solvers.elimination_steps(125, renamed)
+        steps = solvers.henneberg_steps(125, renamed)
         assert steps is not None
         place = np.argsort(steps[:, 0])
         assert sorted(steps[:, 1:][steps[:, 1:] >= 0].tolist()) == list(range(len(edges)))
@@ -298,7 +298,7 @@ def test_order_of_the_sweep_is_found_whatever_the_numbers(rng):
             others = [renamed[e].sum() - i for e in mine if e >= 0]
             assert len(others) == min(s, 3)
             assert all(place[j] < s for j in others)
-    assert solvers.elimination_steps(8, graphs.CUBE_EDGES) is None
+    assert solvers.henneberg_steps(8, graphs.CUBE_EDGES) is None
 
 
 def test_dissection_orders_every_agent_once():

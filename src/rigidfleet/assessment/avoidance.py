@@ -50,7 +50,7 @@ def avoidance_notes(measured: Measurements) -> Iterator[str]:
         if doubt := _why_guarantee_is_unproved(measured):
             words = f"was held at every tick, but is not proved: {doubt}"
         yield f"the guarantee of [avoidance] {words}"
-    yield from _avoidance_time_notes(measured.result)
+    yield from _avoidance_share_notes(measured.result)
 
 
 def clock_notes(result: Result) -> Iterator[str]:
@@ -71,7 +71,7 @@ def clock_notes(result: Result) -> Iterator[str]:
         )
 
 
-def _avoidance_time_notes(result: Result) -> Iterator[str]:
+def _avoidance_share_notes(result: Result) -> Iterator[str]:
     """The share of time by layer, and how far the body was beside its path."""
     rate, way, acts = result.clock_rate, result.body_displacement, result.avoidance_layers
     if rate is None or way is None or acts is None or len(result.time) < 2:

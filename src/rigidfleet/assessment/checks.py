@@ -41,7 +41,7 @@ def all_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[C
     """All checks of a flight: whether it is complete and its record true, its ends of phases, its quantities."""
     yield _completeness_check(measured.result)
     yield from _record_consistency_check(measured)
-    yield from _no_sample_near_checks(measured)
+    yield from _missing_sample_checks(measured)
     yield from _failures_or_nearest(
         [
             *_settling_checks(phases),
@@ -109,7 +109,7 @@ def _record_consistency_check(measured: Measurements) -> Iterator[CheckResult]:
         yield CheckResult("record", False, words, when=when)
 
 
-def _no_sample_near_checks(measured: Measurements) -> Iterator[CheckResult]:
+def _missing_sample_checks(measured: Measurements) -> Iterator[CheckResult]:
     """Fail waypoints and ends of shaping phases that no sample is near: they cannot be judged."""
     from rigidfleet.mission import KINDS  # takes long to load, and the flight has loaded it
 

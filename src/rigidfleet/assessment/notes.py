@@ -23,7 +23,7 @@ def verdict_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
     """Facts that fail no check but that a reader should know."""
     yield from _abandoned_phase_notes(measured)
     yield from _negative_height_notes(measured)
-    yield from _upside_down_notes(measured, phases)
+    yield from _formation_flip_notes(measured, phases)
     yield from _fall_notes(measured)
     pairs, times = measured.mission.links_lost
     for (i, j), t in zip(pairs + 1, times, strict=True):
@@ -150,7 +150,7 @@ def _negative_height_notes(measured: Measurements) -> Iterator[str]:
         yield f"{e.who} {words}; the mission has no ground"
 
 
-def _upside_down_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
+def _formation_flip_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     """Note planar formations that turn over between phases while no attitude is commanded."""
     seen: dict[str, tuple[list[float], float]] = {}
     for i, p in enumerate(phases):

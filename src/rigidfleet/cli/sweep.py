@@ -199,7 +199,7 @@ def _sweep_and_folder(
             f"--{chosen[0]}: is of others' trajectories, by --drill; a mission has its own. Remove it."
         )
     if others:
-        mission = _judging_mission(here, **limits)
+        mission = _mission_of_trajectories(here, **limits)
         keys["drill"] = {"files": [str(here.resolve())]}
         definition = Sweep.of(mission, vary, runs=runs, origin="rigidfleet sweep", **keys)
     elif not named and is_sweep_file(what):
@@ -209,7 +209,7 @@ def _sweep_and_folder(
     return definition, out or Path("sweeps", definition.name)
 
 
-def _judging_mission(path: Path, separation: float | None, radius: float | None) -> Mission:
+def _mission_of_trajectories(path: Path, separation: float | None, radius: float | None) -> Mission:
     """What others' trajectories are judged by.
 
     Raises

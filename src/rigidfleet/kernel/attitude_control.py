@@ -158,7 +158,7 @@ def rotor_speeds(f, curve, limits, out):
 
 
 @jit
-def desired_attitude(k, i, flight, state, F):
+def write_desired_attitude(k, i, flight, state, F):
     """Desired attitude of vehicle i at tick k, for the desired force F (3,), into ``work.desired``."""
     vehicles, tables, work = flight.vehicles, flight.tables, state.work
     m, row = vehicles.m[i], k - tables.first
@@ -206,7 +206,7 @@ def command_rotors(k, i, flight, state):
         for q in range(3):
             desired[3, q], desired[4, q] = commands.rates[i, q], 0.0
     else:
-        desired_attitude(k, i, flight, state, F)
+        write_desired_attitude(k, i, flight, state, F)
         thrust = F[0] * T[2, 0] + F[1] * T[2, 1] + F[2] * T[2, 2]
     attitude_torque(
         T, S[10:13], desired, vehicles.inertia[i], vehicles.k_R[i], vehicles.k_omega[i], tau

@@ -31,7 +31,7 @@ from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.constraint import find_multipliers
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve, copy_vector
 from rigidfleet.kernel.moving import relative_braking_limit
-from rigidfleet.kernel.segments import obstacle_distance, segment_obstacle_distance
+from rigidfleet.kernel.segments import obstacle_distance, segment_obstacle_bounds
 
 #: Greatest number of sweeps, change of an acceleration that ends them [m/s^2].
 _SWEEPS, _CLOSE = 10, 5e-5
@@ -112,9 +112,9 @@ def least_passing_acceleration(i, o, r, v, avoid):
         q[k] = p[k] + _AHEAD * (v[k] - x[3 + k])
     keep = avoid.reach[i] + avoid.spare[i] + bound[0]
     most = keep + _AHEAD * bound[1]
-    if segment_obstacle_distance(p, q, o, avoid.solids, most, avoid.normal)[1] >= most:  # quick
+    if segment_obstacle_bounds(p, q, o, avoid.solids, most, avoid.normal)[1] >= most:  # quick
         return -math.inf
-    _, away, share = segment_obstacle_distance(p, q, o, avoid.solids, math.nan, avoid.normal)
+    _, away, share = segment_obstacle_bounds(p, q, o, avoid.solids, math.nan, avoid.normal)
     t = _AHEAD * share
     missing = keep + t * bound[1] - away
     along = fast = 0.0
@@ -233,7 +233,7 @@ def enforce_barrier(k, avoid):
 
 @jit
 def update_edge_pulls(p, w, avoid):
-    """The same for all edges."""
+    """Let all edges pull as they must with the present accelerations; returns the change that it makes [m/s^2]."""
     change = 0.0
     for e in range(p.graph.edges.shape[0]):
         i, j, n = p.graph.edges[e, 0], p.graph.edges[e, 1], w.u[e]

@@ -99,7 +99,7 @@ def post_clock(k, i, clocks, own, message):
 
 
 @jit
-def update_greatest_error(i, k, error, net, mail, own):
+def update_worst_tracking_error(i, k, error, net, mail, own):
     """Take the error of vehicle i [m] at tick k, or a greater one that it has heard of.
 
     What was measured a time of silence ago counts nothing, and newer errors count more until then. So a great error
@@ -147,7 +147,7 @@ def apply_own_clock(i, k, t, p, w, flight, state):
             error += away * away
             own[SLOT + q], own[SLOT + 3 + q] = w.r_ref[i, q], w.v_ref[i, q]
             own[SLOT + 6 + q] = w.a_ref[i, q]
-    update_greatest_error(i, k, math.sqrt(error), net, mail, own)
+    update_worst_tracking_error(i, k, math.sqrt(error), net, mail, own)
     stuck = False
     for n in range(flight.clocks.stuck.shape[0]):
         one = flight.clocks.stuck[n]

@@ -53,7 +53,7 @@ from rigidfleet.kernel.segments import (
     parabola_min,
     refined_obstacle_distance,
     segment_distance,
-    segment_obstacle_distance,
+    segment_obstacle_bounds,
 )
 
 #: Neighbours are listed for speeds higher by this share and summand [m/s], and for ways of this share of their
@@ -166,10 +166,10 @@ def clears_static_obstacles(i, v, far, avoid):
             continue
         # Its stop segment after the tick, then its path over the tick as in `is_apart`: a parabola beyond the chord.
         after = avoid.ways[i, 4] if avoid.soft[i] > 0.0 else way[1]
-        bound, _, _ = segment_obstacle_distance(after, way[2], o, solids, floor, normal)
+        bound, _, _ = segment_obstacle_bounds(after, way[2], o, solids, floor, normal)
         if bound < floor:
             return False
-        bound, value, x = segment_obstacle_distance(way[0], way[1], o, solids, floor, normal)
+        bound, value, x = segment_obstacle_bounds(way[0], way[1], o, solids, floor, normal)
         if bound < floor:
             return False
         along = rate = rise = 0.0
@@ -499,7 +499,7 @@ def command_force(i, state, avoid):
 
 
 @jit
-def wanted_acceleration(i, state, avoid):
+def set_wanted_acceleration(i, state, avoid):
     """The acceleration that vehicle i is asked for, with its thrust limited."""
     force = state.force[i]
     size = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
@@ -563,7 +563,7 @@ def correct_forces(p, w, flight, state, avoid):
         weaken_edge_forces(p, w, state, avoid)
     write_measured_states(k, r, v, flight, state)
     for i in range(n):
-        wanted_acceleration(i, state, avoid)
+        set_wanted_acceleration(i, state, avoid)
         if avoid.soft[i] > 0.0:
             move_to_lag_free_point(i, flight.vehicles, state, r[i], v[i], avoid)
         else:

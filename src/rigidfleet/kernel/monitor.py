@@ -90,7 +90,7 @@ def store_if_worse(kind, value, t, first, second, monitor):
 
 
 @jit
-def quaternion_extremes(points, p):
+def quaternion_rate_and_length(points, p):
     """Greatest rate, over a step, and least length of the quaternion of the body axes, by its control points."""
     first = 6 * p.vehicles.m.shape[0] + p.graph.edges.shape[0]
     fastest, least = 0.0, math.inf
@@ -108,7 +108,7 @@ def frame_rotation_bound(points, p):
     """Upper bound of the rotation [rad] of the axes of the states over a step: 0 in the inertial formulation."""
     if not p.body_formulation:
         return 0.0
-    rate, length = quaternion_extremes(points, p)
+    rate, length = quaternion_rate_and_length(points, p)
     return 2.0 * rate / max(length, 1e-3)
 
 
@@ -256,7 +256,7 @@ def bound_distance_changes(p, state, monitor):
     if p.body_formulation:
         # The axes turn as well, and where the vertical is in them is not asked: any rotation may tilt. A quaternion
         # between its control points may be shorter than they are, hence the tenth.
-        rate, length = quaternion_extremes(points, p)
+        rate, length = quaternion_rate_and_length(points, p)
         turn = math.sqrt(turn_x * turn_x + turn_y * turn_y + turn_z * turn_z)
         tilt = 2.0 * rate / max(length - 0.1, 0.1) + turn
     # Of two agents, each may move by its part, and tilting moves each by at most its distance from the mean.

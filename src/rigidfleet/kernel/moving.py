@@ -16,7 +16,7 @@ import math
 from rigidfleet.kernel.avoidance import FOLLOWED, KNOWN, UNKNOWN
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import jit
-from rigidfleet.kernel.segments import obstacle_distance, parabola_min, segment_obstacle_distance
+from rigidfleet.kernel.segments import obstacle_distance, parabola_min, segment_obstacle_bounds
 from rigidfleet.solids.distance import is_solid_present, solid_displacement
 
 #: Standard deviations that bounds of an estimate have.
@@ -224,9 +224,9 @@ def moving_obstacle_margin(i, v, avoid):
         # Three distances: of the stop segment after the tick, of the chord of the tick, and of the parabola beyond it.
         for q in range(3):
             out[2, q] = out[1, q] + stop / max(after, 1e-12) * out[2, q]
-        bound, value, _ = segment_obstacle_distance(out[1], out[2], o, solids, floor, normal)
+        bound, value, _ = segment_obstacle_bounds(out[1], out[2], o, solids, floor, normal)
         room = min(room, (value if value < floor else bound) - floor)
-        bound, value, share = segment_obstacle_distance(out[0], out[1], o, solids, floor, normal)
+        bound, value, share = segment_obstacle_bounds(out[0], out[1], o, solids, floor, normal)
         room = min(room, (value if value < floor else bound) - floor)
         along = rate = lift = 0.0
         for q in range(3):

@@ -97,7 +97,7 @@ def segment_distance_and_slope(p, q, x, o, solids, normal):
 
 
 @jit
-def segment_obstacle_distance(p, q, o, solids, enough, normal):
+def segment_obstacle_bounds(p, q, o, solids, enough, normal):
     """Distance of the segment from p to q (3,) from obstacle o: a lower bound, and a place near the nearest point.
 
     The distance to a convex obstacle is convex along the segment, so that it lies above its tangents. The bound is
@@ -128,9 +128,9 @@ def segment_obstacle_distance(p, q, o, solids, enough, normal):
 @jit
 def refined_obstacle_distance(p, q, o, solids, need, normal):
     """Distance of the segment from p to q (3,) from obstacle o: exact below ``need``, else a lower bound."""
-    kept, _, _ = segment_obstacle_distance(p, q, o, solids, need, normal)
+    kept, _, _ = segment_obstacle_bounds(p, q, o, solids, need, normal)
     if kept < need:
-        kept, _, _ = segment_obstacle_distance(p, q, o, solids, math.nan, normal)
+        kept, _, _ = segment_obstacle_bounds(p, q, o, solids, math.nan, normal)
     return kept
 
 

@@ -299,7 +299,7 @@ def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Floats:
 
 
 def _check_vectors(name: str, value: ArrayLike, *shape: int) -> Floats:
-    """Floats of floats whose last axes have this shape."""
+    """Array of floats whose last axes have this shape."""
     array = np.asarray(value, dtype=float)
     if array.shape[-len(shape) :] != shape:
         wanted = ", ".join(["...", *map(str, shape)])

@@ -230,7 +230,7 @@ def formation_loops(
     law: LoopGains,
     lags: Sequence[Lag],
 ) -> list[Loop]:
-    """The distinct parts of a formation's loop at rest, for `stability_margins`, `is_stable` and `largest_pole`.
+    """The distinct parts of a formation's loop at rest, for `stability_margins`, `is_stable` and `largest_stable_pole`.
 
     Gains of the law may change afterwards; the solver, its options, and the control may not.
 

@@ -29,7 +29,7 @@ def taylor_derivatives(x: Floats) -> Floats:
 
 
 def series_by_derivatives(x: Floats) -> Floats:
-    """The series of which `derivatives` are ``x`` (n + 1, ...)."""
+    """The series of which `taylor_derivatives` are ``x`` (n + 1, ...)."""
     return x / _factorial_column(x)
 
 

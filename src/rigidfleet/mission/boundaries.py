@@ -226,7 +226,7 @@ class BoundaryWatch:
             if start.max() > least:
                 k = int(start.argmax())
                 least = float(start[k])
-                self._keep_worst(x, least, float(clock[starts[k // len(agents)], 0]), int(every[k]))
+                self._set_worst(x, least, float(clock[starts[k // len(agents)], 0]), int(every[k]))
             near = (x.measure(boxes, every)[2] > least + x.close).reshape(len(starts), -1)
             step, who = np.nonzero(np.repeat(near, _BOXED, axis=0)[: len(clock)])
 
@@ -238,8 +238,8 @@ class BoundaryWatch:
             peak = greatest_curve_measure(points[step, who], measure, lambda _, x=x: x.close, least)
             if peak.curve >= 0:
                 t, h = clock[step[peak.curve]].tolist()
-                self._keep_worst(x, peak.value, t + peak.place * h, int(agents[who[peak.curve]]))
+                self._set_worst(x, peak.value, t + peak.place * h, int(agents[who[peak.curve]]))
 
-    def _keep_worst(self, x: _Boundary, rank: float, when: float, who: int) -> None:
+    def _set_worst(self, x: _Boundary, rank: float, when: float, who: int) -> None:
         value = float(QUANTITIES[x.quantity].rank(rank))
         self.worst[x.quantity] = Worst(value, when, who, x.number)

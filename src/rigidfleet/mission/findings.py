@@ -89,7 +89,7 @@ class FindingCollector:
         return []
 
     def model_of_kind(self, data: Any, path: Keys, kinds: Mapping[str, type[Any]]) -> Any:
-        """Return the model for the `model_of_kind` of a table, or None with a finding."""
+        """Return the model for the ``kind`` of a table, or None with a finding."""
         choice = f"use one of {', '.join(kinds)}"
         if not isinstance(data, dict):
             self.add(path, "must be a table", f"write [[{path[0]}]] above it")

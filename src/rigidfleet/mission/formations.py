@@ -73,7 +73,7 @@ def _own_formation_rules(m: Draft, form: Formation, name: str) -> Breaches:
     """A formation has slots or distances for all agents, and nothing without effect."""
     path, n = ("formations", name), m.n
     if n is not None and (form.rest is not None or form.agents is not None):
-        m.formations[name] = form = yield from _add_slots(m, form, n, path)
+        m.formations[name] = form = yield from _pad_slots(m, form, n, path)
     right = m.is_valid(path, "shape", "size", "slots", "distances")
     if form.shape is not None and form.slots is not None:
         yield Breach("slots", "a shape has its own slots", "give either shape and size or slots")
@@ -118,7 +118,7 @@ def _own_formation_rules(m: Draft, form: Formation, name: str) -> Breaches:
             yield Breach("dimension", problem, "use 3, or move the slots into a plane")
 
 
-def _add_slots(m: Draft, form: Formation, n: int, path: Keys) -> Generator[Breach, None, Formation]:
+def _pad_slots(m: Draft, form: Formation, n: int, path: Keys) -> Generator[Breach, None, Formation]:
     """A formation of fewer than n agents gets slots for all: those that rest come last."""
     slots = form.slots
     if form.agents is not None:

@@ -62,7 +62,7 @@ def loss_rules(m: Draft) -> Breaches:
     if d.on_loss == "land":
         if not grounded:
             yield Breach((_TABLE, "on_loss"), *_NO_GROUND)
-        yield from _level_landing_rules(m, d, m.n, first)
+        yield from _level_formation_rules(m, d, m.n, first)
 
 
 def _abort_rules(m: Draft) -> Breaches:
@@ -153,7 +153,7 @@ def _possible_formations(phases: Sequence[AnyPhase], t: float) -> list[str | Non
     return list(held)
 
 
-def _level_landing_rules(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
+def _level_formation_rules(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
     """Vehicles of a formation that lands reach the ground together."""
     forms, radius, name = m.formations, m.agents.radius, d.landing_formation
     if name is not None:
@@ -163,7 +163,7 @@ def _level_landing_rules(m: Draft, d: Disturbances, n: int, first: float) -> Bre
             yield Breach(where, "there is no such formation", remedy)
             return
         slots = forms[name].slot_array(n) if has_no_findings(m, name) else None
-        words = "it has no slots to track" if slots is None else _uneven_landing_text(slots, radius)
+        words = "it has no slots to track" if slots is None else _height_spread_text(slots, radius)
         if words:
             remedy = "name a level formation, such as a line or a square"
             yield Breach(where, f"cannot land: {words}", remedy)
@@ -172,14 +172,14 @@ def _level_landing_rules(m: Draft, d: Disturbances, n: int, first: float) -> Bre
         points = np.array(m.agents.position) if one is None else forms[one].slot_array(n)
         if points is None:
             continue  # distances alone cannot be tracked, which is another finding
-        if words := _uneven_landing_text(points, radius):
+        if words := _height_spread_text(points, radius):
             what = "the start" if one is None else f"'{one}'"
             problem = f"{what} cannot land as it is: {words}"
             remedy = "give landing_formation, a level formation that is taken before the descent"
             yield Breach((_TABLE, "on_loss"), problem, remedy)
 
 
-def _uneven_landing_text(points: Floats, radius: Sequence[float]) -> str:
+def _height_spread_text(points: Floats, radius: Sequence[float]) -> str:
     """Why vehicles at these places (N, 3) do not reach the ground together; "" if they do."""
     points, size = np.asarray(points), np.array(radius)
     bottom = points[:, 2] - size

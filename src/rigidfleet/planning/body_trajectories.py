@@ -120,13 +120,13 @@ def points_passed(through: Sequence[Through], motion: Motion) -> tuple[dict[str,
     return tuple(at | {"time": t} for at, t in zip(points, times, strict=True))
 
 
-def pose_turn_from(start: Pose, T1: Floats) -> Floats:
+def pose_turn_from(pose: Pose, T1: Floats) -> Floats:
     """Rotation vector phi [rad] from an attitude T1 (3, 3) to that of a pose, and three derivatives (4, 3).
 
     Exp(phi) = T1 T^T, differentiated by the pose's body rates.
     """
-    omega = series.series_by_derivatives(np.stack([start.omega, start.alpha, start.alpha_dot]))
-    R = series.rotation_series_from_rates(start.T.T, omega)
+    omega = series.series_by_derivatives(np.stack([pose.omega, pose.alpha, pose.alpha_dot]))
+    R = series.rotation_series_from_rates(pose.T.T, omega)
     return series.taylor_derivatives(series.rotation_vector_taylor(T1 @ R))
 
 

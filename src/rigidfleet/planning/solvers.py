@@ -38,12 +38,12 @@ def choose_method(n: int, edges: Ints, solver: str) -> Method:
     Laws that need eigenvalues ("spectral", "pinv") are solved densely at any size.
     """
     size = system_size(n, len(edges), solver)
-    if solver == "exact" and size >= FROM_ELIMINATION and elimination_steps(n, edges) is not None:
+    if solver == "exact" and size >= FROM_ELIMINATION and henneberg_steps(n, edges) is not None:
         return "elimination"
     return "sparse" if solver in ("iterated", "exact") and size >= FROM_SPARSE else "dense"
 
 
-def elimination_steps(n: int, edges: Ints) -> Ints | None:
+def henneberg_steps(n: int, edges: Ints) -> Ints | None:
     """An order (n, 4) in which each agent is joined to three before it: agent, its edges (-1: none).
 
     The first three agents have none, one and two. None if there is no such order. Agents with three remaining edges

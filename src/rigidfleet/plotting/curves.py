@@ -283,7 +283,7 @@ def inputs(result: Result) -> Figure:
     below.set_ylabel("enlarged [N]")
     if not st.note_if_constant(below, result.thrust, "N"):
         panel = Panel(below, result, result.thrust, "N", result.extreme("thrust"))
-        panel.leave_out_final_peak()
+        panel.crop_final_peak()
         _widen_limits(below, min(0.1, 0.1 * peak_before_breakdown(result, result.thrust)))
         panel.mark_peak()
     st.draw_agents_legend(above, result.n_agents)
@@ -306,7 +306,7 @@ def constraint_force(result: Result) -> Figure:
     if not edges.note_if_rounding():
         draw_edge_lines(below, result, tension)
         below.axhline(0.0, color=st.FAINT, linewidth=0.6, zorder=1)
-        edges.leave_out_final_peak()
+        edges.crop_final_peak()
         edges.mark_peak(always=False)
         st.draw_legend(below, edge_handles(result))
     return fig

@@ -107,7 +107,7 @@ class Panel:
         st.mark_empty(self.ax, f"only rounding errors: at most {size[k, i]:.3g} {self.unit}{where}")
         return True
 
-    def leave_out_final_peak(self) -> None:
+    def crop_final_peak(self) -> None:
         """Choose limits that leave out the final peak of a flight that broke down."""
         top = peak_before_breakdown(self.result, self.values)
         if top < np.nanmax(np.abs(self.values), initial=0.0):

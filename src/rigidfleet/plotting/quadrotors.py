@@ -58,13 +58,13 @@ def _rotor_nearest_to_limit(result: Result, limits: Floats) -> Extremum | None:
 def rotors(result: Result) -> Figure:
     """Greatest force of a rotor of each vehicle as a share of its limit; all rotors of the one nearest to its limit."""
     fig, (above, below) = st.time_figure(result, "Force of the rotors", 2)
-    _draw_greatest_rotor(above, result)
+    _draw_rotor_limit_shares(above, result)
     st.draw_agents_legend(above, result.n_agents)
     _draw_rotors_of_nearest(below, result)
     return fig
 
 
-def _draw_greatest_rotor(ax: Axes, result: Result) -> None:
+def _draw_rotor_limit_shares(ax: Axes, result: Result) -> None:
     """The greatest of the four rotors of each vehicle, as a share of its limit."""
     limits = rotor_limits(result.mission)
     share = 100.0 * rotor_forces(result).max(axis=2) / limits
@@ -86,7 +86,7 @@ def _draw_rotors_of_nearest(ax: Axes, result: Result) -> None:
     colours = st.colour_scale(4)
     for k, colour in enumerate(colours):
         ax.plot(result.time, force[:, i, k], color=colour, linewidth=1.9 - 0.35 * k)
-    Panel(ax, result, force[:, i], "N").leave_out_final_peak()
+    Panel(ax, result, force[:, i], "N").crop_final_peak()
     low, high = ax.get_ylim()
     if limits[i] < high + 0.3 * (high - low):
         st.draw_limit(ax, float(limits[i]), f"limit {limits[i]:.4g} N")

@@ -153,7 +153,7 @@ def draw_graph(
         ax.axhspan(-room, room, facecolor=st.NIGHT, linewidth=0, zorder=0, gid="night")
     shown = lights or st.agent_colours(n)
     if n > st.MANY:
-        _draw_mesh(ax, p, edges, colours, shown)
+        _draw_swarm(ax, p, edges, colours, shown)
         return
     for e in np.argsort(p[edges, 2].mean(axis=1)) if len(edges) else []:
         i, j = edges[e]
@@ -191,7 +191,7 @@ def draw_graph(
             )  # fmt: skip
 
 
-def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str], shown: Sequence[str]) -> None:
+def _draw_swarm(ax: Axes, p: Floats, edges: Any, colours: list[str], shown: Sequence[str]) -> None:
     """Draw a graph of many agents in the colours shown, with the far parts first and fainter."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgba_array

@@ -19,14 +19,14 @@ def is_left_to_avoidance(mission: Mission, topic: str, limit: float = 0.0) -> bo
     return topic == "obstacle" or (a.guard and (a.separation is None or a.separation >= limit))
 
 
-def braking_remarks(mission: Mission) -> Iterator[Remark]:
+def avoidance_remarks(mission: Mission) -> Iterator[Remark]:
     """Remark on landings, and on the two, vehicles or an obstacle at rest, that braking at the start leaves nearest."""
     if any(phase.lands for phase in mission.phases) and (words := why_no_landing(mission)):
         yield Remark("fails", "avoidance", words)
     if mission.avoidance is None or not mission.avoidance.guard:
         return
     from rigidfleet.kernel.moving import way_to_rest
-    from rigidfleet.kernel.segments import segment_distance, segment_obstacle_distance
+    from rigidfleet.kernel.segments import segment_distance, segment_obstacle_bounds
     from rigidfleet.planning.vehicles import sampled_flight
 
     a = avoidance_in_flight(mission, sampled_flight(mission))
@@ -44,7 +44,7 @@ def braking_remarks(mission: Mission) -> Iterator[Remark]:
             if room < worst:
                 worst, who = room, f"agents {j + 1} and {i + 1}"
         for o in np.flatnonzero(a.sight.moves == 0):
-            nearest = segment_obstacle_distance(r[i], stop[i], o, a.solids, np.nan, a.normal)
+            nearest = segment_obstacle_bounds(r[i], stop[i], o, a.solids, np.nan, a.normal)
             if nearest[0] - a.reach[i] < worst:
                 worst = nearest[0] - a.reach[i]
                 who = f"agent {i + 1} and '{mission.obstacles[o].name}'"

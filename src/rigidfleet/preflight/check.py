@@ -18,7 +18,7 @@ from rigidfleet.planning.timing import complete_times
 from rigidfleet.planning.vehicles import lags_by_vehicle, tracking_lag_times
 from rigidfleet.preflight import trajectory
 from rigidfleet.preflight.assignment import assignment_remarks
-from rigidfleet.preflight.avoidance import braking_remarks
+from rigidfleet.preflight.avoidance import avoidance_remarks
 from rigidfleet.preflight.findings import Preflight, Remark
 from rigidfleet.preflight.formations import SEARCHED, check_formations, formation_remarks
 from rigidfleet.preflight.gains import check_pid_gains, gain_remarks
@@ -58,7 +58,7 @@ def check(
     progress("planned paths")
     planned, known = preview_phases(mission)
     preflight = Preflight(mission, formations, check_pid_gains(mission, formations), planned)
-    trajectory.find_greatest(mission, preflight)
+    trajectory.find_planned_peaks(mission, preflight)
     if not known:
         preflight.judged_to = float(planned[-1].time[-1]) if planned else 0.0
     if lags := lags_by_vehicle(mission):
@@ -79,7 +79,7 @@ def check(
         *assignment_remarks(mission, preflight),
         *trajectory.reference_step_remarks(mission, preflight),
         *vehicle_remarks(mission, preflight),
-        *braking_remarks(mission),
+        *avoidance_remarks(mission),
         *trajectory.disturbance_remarks(mission, preflight),
         *steady_offset_remarks(mission, preflight),
         *obstacle_remarks(mission, preflight),

@@ -102,7 +102,7 @@ def _check_formation(
     rigidity = analyse(slots, edges, masses=masses, dimension=space)
     check = replace(check, rigidity=rigidity)
     endless = rigidity.own.rigidity_class is RigidityClass.FLEXIBLE  # a continuum of other shapes
-    if not search or endless or slot_mismatch_in_words(mission, name):
+    if not search or endless or distance_mismatch_in_words(mission, name):
         return check
     start, space = mission.agents.position, rigidity.own.space
     others = realisations(slots, edges, starts=STARTS, start=start, dimension=space)
@@ -120,7 +120,7 @@ def _formation_control(mission: Mission, name: str) -> _Held:
     return "tracking" if controls == {"tracking"} else "distances"
 
 
-def slot_mismatch_in_words(mission: Mission, name: str) -> str:
+def distance_mismatch_in_words(mission: Mission, name: str) -> str:
     """Whose given distance differs most from that of their slots, and by how much; "" within tolerance."""
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
     if slots is None or not len(edges):
@@ -151,12 +151,12 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         if f.rigidity is not None and f.held_by == "distances"
         and (f.rigidity.rigidity_class is RigidityClass.FLEXIBLE or f.rigidity.space < 3)
     }  # fmt: skip
-    forecasts = _dimension_error_forecasts(mission, soft)
+    forecasts = _soft_formation_forecasts(mission, soft)
     for f in formations:
         if f.held_by == "nothing":
             continue
         alone = f.held_by == "distances"
-        if words := slot_mismatch_in_words(mission, f.name):
+        if words := distance_mismatch_in_words(mission, f.name):
             yield _fails(words)
         r = f.rigidity
         if f.spectrum is not None:
@@ -227,7 +227,7 @@ def _stuck_flat_remarks(mission: Mission) -> Iterator[Remark]:
         return
 
 
-def _dimension_error_forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]:
+def _soft_formation_forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]:
     """What becomes of some formations that distances alone hold, if only forces along their edges move the agents.
 
     By name: the greatest dimension of the space that the agents keep to, and the greatest error of a pair at the end of
@@ -291,7 +291,7 @@ def _realisation_remarks(mission: Mission, f: FormationCheck, *, alone: bool) ->
     if first is not None and first.formation == f.name:
         by = reference_kind(mission, first, start, slots)
     end = None if others.leads_to is None else others.shapes[others.leads_to].kind
-    if by == "shape" and slots is not None and _passes_plane(start, slots):
+    if by == "shape" and slots is not None and _become_coplanar(start, slots):
         yield _note(
             f"the agents start with the handedness of the mirror image of '{f.name}' and must pass through a plane,"
             " where distances alone may return them to the mirror image. Swap two slots or track slots"
@@ -311,7 +311,7 @@ def _realisation_remarks(mission: Mission, f: FormationCheck, *, alone: bool) ->
         )
 
 
-def _passes_plane(start: Floats, slots: Floats) -> bool:
+def _become_coplanar(start: Floats, slots: Floats) -> bool:
     """Whether straight paths of four agents from a start to spatial slots (4, 3) pass through a plane."""
     if len(slots) != 4 or distance_geometry.dimension(slots) < 3:
         return False

@@ -86,7 +86,7 @@ class LinearFlight:
         L, n3, iterations = len(i), 3 * self.n, law.iterations if iterated else 1
         unit = r[i] - r[j]
         unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-        own, other = (_component_map(unit, x, n3) for x in (i, j))
+        own, other = (_component_matrix(unit, x, n3) for x in (i, j))
         #: Errors of edges (m, N 3) of places.
         self.edges = (own - other)[i < j]
         inverse = 1.0 / masses
@@ -237,12 +237,12 @@ class LinearFlight:
         return news
 
 
-def _component_map(unit: Floats, who: Ints, columns: int) -> Any:
-    """The map (L, 3 N) of vectors of vehicles to the components of one of them (L,) along unit vectors (L, 3)."""
+def _component_matrix(directions: Floats, who: Ints, columns: int) -> Any:
+    """The map (L, 3 N) of vectors of vehicles to the components of one of them (L,) along ``directions`` (L, 3)."""
     from scipy import sparse
 
     places = np.repeat(np.arange(len(who)), 3), (3 * who[:, None] + range(3)).ravel()
-    return sparse.csr_array((unit.ravel(), places), (len(who), columns))
+    return sparse.csr_array((directions.ravel(), places), (len(who), columns))
 
 
 def _transition_matrix(t: float, lags: Sequence[Lag], drag: Floats, orders: int) -> Floats:

@@ -26,7 +26,7 @@ from rigidfleet.rigidity import analyse
 
 def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on lost links, and on the way of those left after the first loss."""
-    yield from _lost_edge_remarks(mission)
+    yield from _lost_link_remarks(mission)
     first = mission.abandons_at
     if not np.isfinite(first):
         return
@@ -83,7 +83,7 @@ def planned_answer_to_loss(mission: Mission, at: Leg, legs: Sequence[Leg]) -> An
     return answer_to_loss(mission, now, lambda: legs)
 
 
-def _lost_edge_remarks(mission: Mission) -> Iterator[Remark]:
+def _lost_link_remarks(mission: Mission) -> Iterator[Remark]:
     """Remarks on the rigidity of each formation without the edges of lost links."""
     pairs, times = mission.links_lost
     if not len(pairs):

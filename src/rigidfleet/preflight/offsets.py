@@ -65,7 +65,7 @@ def sampled_slot_offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floa
         for k, push in enumerate(flat):
             answers[k] = now[:, 1]
             now = steps[:, :3, :3] @ now + steps[:, :3, 3:] * push
-        by_phase.append(_offsets_with_edges(mission, planned, pushed, answers))
+        by_phase.append(_offsets_of_both_laws(mission, planned, pushed, answers))
     return by_phase
 
 
@@ -84,7 +84,7 @@ def _unmodelled_accelerations(mission: Mission, planned: PlannedPhase) -> Floats
     return force / mass
 
 
-def _offsets_with_edges(
+def _offsets_of_both_laws(
     mission: Mission, planned: PlannedPhase, pushed: Floats, answers: Floats
 ) -> Floats:
     """Offsets (K, N, 3) of the tracking (K, 0, 3N), but of the constraint law (K, 1, 3N) in what edges hold."""

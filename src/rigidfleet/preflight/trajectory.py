@@ -131,32 +131,32 @@ def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             yield Remark("fails" if exact else "note", "downwash", text)
 
 
-def _worst_force_time_and_limit(
-    way: list[PlannedPhase], needs: list[Floats], limits: Floats
+def _value_nearest_to_limit(
+    way: list[PlannedPhase], values: list[Floats], limits: Floats
 ) -> tuple[float, float, str, float]:
-    """Of the forces (K, N) [N] of each phase, the one nearest to its limit (N,) [N], or the greatest if there is none.
+    """Of values (K, N) of each phase, the one nearest to its limit (N,), or the greatest if there is none.
 
     Its value, time [s], agent and limit.
     """
     room = limits if np.isfinite(limits).any() else 0.0
-    planned, need = max(zip(way, needs, strict=True), key=lambda pair: (pair[1] - room).max())
-    k, i = np.unravel_index(int((need - room).argmax()), need.shape)
-    return float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])
+    planned, x = max(zip(way, values, strict=True), key=lambda pair: (pair[1] - room).max())
+    k, i = np.unravel_index(int((x - room).argmax()), x.shape)
+    return float(x[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])
 
 
-def find_greatest(mission: Mission, preflight: Preflight) -> None:
+def find_planned_peaks(mission: Mission, preflight: Preflight) -> None:
     """Find the greatest planned speeds [m/s] and the thrust [N] that is nearest to its limit, at samples."""
     way = preflight.planned_phases
     if not way:
         return
     mass, weight = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
     needs = [mass * np.linalg.norm(planned.acceleration + weight, axis=2) for planned in way]
-    preflight.thrust = _worst_force_time_and_limit(way, needs, mission.fleet.thrust_limit)
+    preflight.thrust = _value_nearest_to_limit(way, needs, mission.fleet.thrust_limit)
     speeds = [np.linalg.norm(planned.velocity, axis=2) for planned in way]
     climbs = [np.abs(planned.velocity[..., 2]) for planned in way]
     unlimited = np.full(mission.n_agents, np.inf)
-    preflight.speed = _worst_force_time_and_limit(way, speeds, unlimited)[:3]
-    preflight.vertical_speed = _worst_force_time_and_limit(way, climbs, unlimited)[:3]
+    preflight.speed = _value_nearest_to_limit(way, speeds, unlimited)[:3]
+    preflight.vertical_speed = _value_nearest_to_limit(way, climbs, unlimited)[:3]
 
 
 def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -178,7 +178,7 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
         force = true[:, None] * (planned.acceleration + g * up)
         force -= drag[:, None] * (wind - planned.velocity)
         needs.append(np.linalg.norm(force, axis=2) + gusts + noise)
-    most = _worst_force_time_and_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
+    most = _value_nearest_to_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
     steady = airflow_force(mission, np.tile(wind, (len(drag), 1)))
     steady -= ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)

@@ -52,7 +52,7 @@ def _constraint_lines(mission: Mission) -> list[GainLine]:
                 ("overshoot", f"{beyond:.3g} %", f"an error passes zero by this share: {why}"),
             ]
     setting = {
-        "iterated": f"μ = {_damping_in_words(mission)}, {c.iterations} iterations",
+        "iterated": f"μ = {_solver_damping_in_words(mission)}, {c.iterations} iterations",
         "spectral": f"s₀ = {c.threshold:g}",
         "exact": "",
         "pinv": f"cut-off at {c.cutoff:g} of the largest w",
@@ -66,7 +66,7 @@ def _constraint_lines(mission: Mission) -> list[GainLine]:
     return lines
 
 
-def _damping_in_words(mission: Mission) -> str:
+def _solver_damping_in_words(mission: Mission) -> str:
     """Damping of the iterated solve; its range over all formations if it depends on them."""
     every = [mission.damping(name) for name in mission.formations] or [mission.damping(None)]
     low, high = f"{min(every):.2g}", f"{max(every):.2g}"

@@ -72,14 +72,14 @@ def spectrum(points: ArrayLike, edges: Ints, masses: ArrayLike) -> Spectrum:
     shift = -1e-6 * w_max
     solve, rigid = splu(K - shift * eye_array(d * n, format="csc")).solve, rigid_motions(p, m)
 
-    def inverse(x: Floats) -> Floats:
+    def apply_inverse(x: Floats) -> Floats:
         y = solve(x - rigid @ (rigid.T @ x))
         return y - rigid @ (rigid.T @ y)
 
-    operator = LinearOperator(K.shape, matvec=inverse, dtype=np.float64)  # ty: ignore
+    operator = LinearOperator(K.shape, matvec=apply_inverse, dtype=np.float64)  # ty: ignore
     try:
         held = eigsh(
-            K, k=_LOWEST, sigma=shift, OPinv=operator, v0=inverse(start), return_eigenvectors=False, tol=1e-9,
+            K, k=_LOWEST, sigma=shift, OPinv=operator, v0=apply_inverse(start), return_eigenvectors=False, tol=1e-9,
             maxiter=_MOST_RESTARTS,
         )  # fmt: skip
     except ArpackNoConvergence:  # many eigenvalues close to zero cannot be separated

@@ -116,7 +116,7 @@ class ActivePhase:
         """
         raise NotImplementedError
 
-    def adapt_reference(self, *, by_law: bool) -> float:
+    def lead_reference(self, *, by_law: bool) -> float:
         """Decide how to fly on, ``by_law`` or under a controller; returns until when that holds [s]."""
         return math.inf
 
@@ -163,7 +163,7 @@ class ActivePhase:
         """
         whole = t_end >= self.plan.t_end
         while self.t < (self.plan.t_end if whole else t_end):
-            decided = self.adapt_reference(by_law=controller is None)
+            decided = self.lead_reference(by_law=controller is None)
             end = min(decided, self.plan.t_end if whole else t_end)
             if controller is None or self.plan.phase.control != "tracking":
                 self._integrate(self.plan.problem, end)

@@ -41,7 +41,7 @@ def mission_as_flown(
         tables = [thing.model_dump(mode="json", exclude_unset=True) for thing in pushed]
         data["obstacles"] = [*own, *tables]
     original = dict(data)
-    data |= _data_as_flown(mission, data, begun, records, step)
+    data |= _changes_as_flown(mission, data, begun, records, step)
     try:
         return mission.rewritten(data, "<dict>"), records
     except MissionError:
@@ -62,7 +62,7 @@ def phase_of_table(
     if flown:
         # Names may repeat: those of phases before are not the new one's business.
         before = [replace(record, name=f"before {k}") for k, record in enumerate(flown, start=1)]
-        data |= _data_as_flown(mission, data, begun, before, mission.output_step)
+        data |= _changes_as_flown(mission, data, begun, before, mission.output_step)
     else:
         data["phases"] = []
     data["phases"] = [*data["phases"], dict(table)]
@@ -133,7 +133,7 @@ def _make_names_unique(flown: Sequence[PhaseRecord]) -> list[PhaseRecord]:
     return records
 
 
-def _data_as_flown(
+def _changes_as_flown(
     mission: Mission,
     own: Mapping[str, Any],
     begun: Sequence[Phase],

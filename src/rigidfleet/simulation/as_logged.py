@@ -129,7 +129,7 @@ def _likely_flight(
         times = [np.arange(log.time[0], log.time[-1], _ALIGNED) for log in logs]
         places = [(t, own.way.at(t)) for t, own in zip(times, smoothed, strict=True)]
         alignment = fit_alignment(places, [Piecewise(planned.time, x) for x in plans], doubts.clock)
-        offsets, late = _offsets_and_errors(alignment, doubts.clock)
+        offsets, late = _clock_offsets_and_errors(alignment, doubts.clock)
         every = np.broadcast_to(offsets, len(logs))
         both = zip(full, every, strict=True)
         full = [log._replace(time=log.time - by) for log, by in both]
@@ -221,7 +221,7 @@ def _planned_ways(plan: Result) -> Piecewise:
     return ways_of(slots._replace(state=state, yaw=still, yaw_rate=still), slice(None))
 
 
-def _offsets_and_errors(alignment: Alignment, clock: Clock) -> Floats:
+def _clock_offsets_and_errors(alignment: Alignment, clock: Clock) -> Floats:
     """By how much stamps are late (2, N or 1) [s] and the error, as far as that is taken out: of each, or of all.
 
     Raises

@@ -172,7 +172,7 @@ class SampledPhase(ActivePhase):
 
     # -- flying -----------------------------------------------------------------------------------
 
-    def adapt_reference(self, *, by_law: bool) -> float:
+    def lead_reference(self, *, by_law: bool) -> float:
         """Let the layers above the barriers lead the reference, if there are any; returns until when that holds [s]."""
         leader, arrays = self.leader, self.vehicles.avoidance
         if self.flight.clocks.own:

@@ -37,8 +37,8 @@ def workspace_and_solver(
     points, edges = plan.before.r if plan.slots is None else plan.slots, plan.edges
     order = None
     if plan.method == "elimination":
-        steps = solvers.elimination_steps(len(points), edges)
-        order = None if steps is None else ordering.pivot_order(steps, plan.problem.graph.edges)
+        steps = solvers.henneberg_steps(len(points), edges)
+        order = None if steps is None else ordering.order_of_steps(steps, plan.problem.graph.edges)
     axes = plan.problem.has_frame or plan.problem.law.k_def > 0.0
     dissect = partial(solvers.agent_dissection_order, points, edges)
     solver = large_solver(plan.problem, Setup(order, dissect, *plan.solver_rtol_and_atol(), axes))

@@ -43,7 +43,7 @@ class Region(NamedTuple):
         """Signed distance (M,) [m] of points (M, 2) from the area as seen from above: negative inside."""
         some = max(1, _TOGETHER // len(self.edges))
         parts = np.split(x, range(some, len(x), some))
-        return np.concatenate([self._distance(self._from_edges(part), part) for part in parts])
+        return np.concatenate([self._distance(self._edge_offsets(part), part) for part in parts])
 
     def curve_depths_and_bounds(self, points: Floats, *, outside: bool) -> tuple[Floats, Floats]:
         """By how much curves are inside (or ``outside``) at their middles (M,) [m], and an upper bound (M,) all along.
@@ -66,7 +66,7 @@ class Region(NamedTuple):
 
     def _depth(self, points: Floats, middles: Floats, *, outside: bool) -> tuple[Floats, Floats]:
         """`curve_depths_and_bounds` as seen from above, of control points (M, 2, P) with middles (M, 2)."""
-        off = self._from_edges(middles)
+        off = self._edge_offsets(middles)
         apart = np.linalg.norm(off, axis=2)
         now = self._distance(off, middles) * (1.0 if outside else -1.0)
         spread = points - middles[:, :, None]
@@ -77,12 +77,12 @@ class Region(NamedTuple):
         bound[kept] = np.minimum(bound[kept], -(apart[kept] + tangents.min(axis=2)).min(axis=1))
         rest = np.flatnonzero((now >= 0.0) | (reach >= -now))
         ends = np.moveaxis(points[rest], 2, 1)
-        far = np.linalg.norm(self._from_edges(ends.reshape(-1, 2)), axis=2)
+        far = np.linalg.norm(self._edge_offsets(ends.reshape(-1, 2)), axis=2)
         far = far.reshape(len(rest), ends.shape[1], len(self.edges)).max(axis=1).min(axis=1)
         bound[rest] = np.minimum(bound[rest], far)
         return now, bound
 
-    def _from_edges(self, x: Floats) -> Floats:
+    def _edge_offsets(self, x: Floats) -> Floats:
         """Vectors (M, E, 2) to points (M, 2) from the nearest point of each edge."""
         begin, along = self.edges[:, 0], self.edges[:, 1] - self.edges[:, 0]
         off = x[:, None] - begin
@@ -120,14 +120,14 @@ def edges_cross(edges: Floats) -> bool:
     """Whether two of the edges (E, 2, 2) cross, or overlap, at more than an end that they share."""
     a, b = edges[:, 0], edges[:, 1]
 
-    def signed_area(p: Floats, q: Floats, r: Floats) -> Floats:
+    def orientation(p: Floats, q: Floats, r: Floats) -> Floats:
         (u, v), (x, y) = np.moveaxis(q - p, -1, 0), np.moveaxis(r - p, -1, 0)
         return u * y - v * x
 
     for k in range(len(edges) - 1):
         p, q = a[k + 1 :], b[k + 1 :]
-        one, other = signed_area(a[k], b[k], p), signed_area(a[k], b[k], q)
-        here, there = signed_area(p, q, a[k]), signed_area(p, q, b[k])
+        one, other = orientation(a[k], b[k], p), orientation(a[k], b[k], q)
+        here, there = orientation(p, q, a[k]), orientation(p, q, b[k])
         crossed = (one * other < 0.0) & (here * there < 0.0)
         along = b[k] - a[k]
         spans = np.sort(np.stack([(p - a[k]) @ along, (q - a[k]) @ along]), axis=0) / (

@@ -112,7 +112,7 @@ def tune(
     flown = own_mission.rewritten(_merge_keys(own_mission.to_dict(), assume or {}))
     paths = _seed_paths(flown)
     seeds, validation = (seeds, validation) if paths else (1, 0)
-    if objective == "shape" and True not in _tracking_of_phases(flown):
+    if objective == "shape" and True not in _phase_tracking_flags(flown):
         objective = "shape-forces"
     options = {
         "objective": objective, "seeds": seeds, "validation": validation, "seed": seed,
@@ -136,7 +136,7 @@ def tune(
     return tuned
 
 
-def _tracking_of_phases(mission: Mission) -> set[bool]:
+def _phase_tracking_flags(mission: Mission) -> set[bool]:
     """Whether phases track slots: what is true of any of them."""
     return {phase.control == "tracking" for phase in mission.phases}
 
@@ -158,7 +158,7 @@ def _option_problems(mission: Mission, budget: int, options: Mapping[str, Any]) 
     if not own_gains(mission):
         yield f"{name}: has no gains to tune: no phase tracks slots, and no edges are stabilised."
     slots = objective != "shape-forces"
-    if slots not in _tracking_of_phases(mission):
+    if slots not in _phase_tracking_flags(mission):
         which, other = ("no", "shape-forces") if slots else ("every", "shape")
         yield f"objective = {objective!r}: {which} phase of {name} tracks slots. Use {other}."
     if mission.vehicle_models is None and mission.disturbances is None:

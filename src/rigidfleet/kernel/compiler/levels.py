@@ -46,7 +46,7 @@ def target_instruction_level() -> str:
 
 
 def runnable_instruction_level() -> str:
-    """The same, to run code of it.
+    """`target_instruction_level`, to run code of it.
 
     Raises
     ------

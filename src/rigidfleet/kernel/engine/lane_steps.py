@@ -135,7 +135,7 @@ def _count_coordinates(k, p):
 
 @jit_inline
 def write_stage_state(k, stage, _a, h, p):
-    """As `dopri5.advance`."""
+    """As `dopri5.write_stage_state`."""
     coordinates = _count_coordinates(k, p)
     p.stage[0] = stage
     if stage == 0:

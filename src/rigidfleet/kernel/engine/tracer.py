@@ -154,7 +154,7 @@ class Trace:
         return []
 
     def known_positive(self, x: Symbol) -> bool:
-        """Whether a number of the problem is positive; `structure` distinguishes those that are not."""
+        """Whether a number of the problem is positive; `code_structure` distinguishes those that are not."""
         return bool(self._values[x.arguments[0]] > 0.0)
 
     def symbol(self, operation: str, *arguments: Any) -> Symbol:
@@ -300,7 +300,7 @@ _ARRAYS = (
     "disturbance.drag", "disturbance.wind",
     "reference.dp", "reference.turn",
 )  # fmt: skip
-#: Places of the slots' turn among the `numbers`.
+#: Places of the slots' turn among the `varying_numbers`.
 TURN = slice(-3, None)
 _MAY_BE_ZERO = {*_NUMBERS[-4:], *_ARRAYS[-2:]}
 _numbers_of, _arrays_of = attrgetter(*_NUMBERS), attrgetter(*_ARRAYS)
@@ -323,7 +323,7 @@ class FlightTrace(Trace):
     Parameters
     ----------
     problem : one of them
-    values : (U, B) `numbers` of all of them
+    values : (U, B) `varying_numbers` of all of them
     moves : for each component of the reference motion, whether it is not zero in all of them
 
     Raises
@@ -375,7 +375,7 @@ class FlightTrace(Trace):
 
 
 def _named_numbers(problem: Problem) -> Iterator[tuple[str, int, Any]]:
-    """Name, place among `numbers` and value of each number, and of each array of numbers."""
+    """Name, place among `varying_numbers` and value of each number, and of each array of numbers."""
     index = 0
     values = (*_numbers_of(problem), *_arrays_of(problem))
     for name, x in zip((*_NUMBERS, *_ARRAYS), values, strict=True):

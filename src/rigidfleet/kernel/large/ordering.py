@@ -8,7 +8,7 @@ from rigidfleet.kernel.records import Order, Pattern
 from rigidfleet.typing import Ints
 
 
-def pivot_order(steps: Ints, edges: NDArray[np.integer]) -> Order:
+def order_of_steps(steps: Ints, edges: NDArray[np.integer]) -> Order:
     """Prepare an order from steps (N, 4), an agent and its edges (-1: none), and edges (m, 2)."""
     agent, edge = steps[:, 0], np.maximum(steps[:, 1:], 0)
     ends = edges[edge].astype(np.int64)
@@ -19,7 +19,7 @@ def pivot_order(steps: Ints, edges: NDArray[np.integer]) -> Order:
 
 
 def symbolic_factorisation(n: int, edges: NDArray[np.integer], order: Ints, most: float) -> Pattern:
-    """Pattern of L with agents eliminated in ``pivot_order`` (N,).
+    """Pattern of L with agents eliminated in ``order`` (N,).
 
     If there are more than ``most`` blocks per agent, fill is omitted: the pattern is that of K.
     """

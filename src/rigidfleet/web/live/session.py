@@ -176,20 +176,20 @@ class Session:
         with self.lock:
             match order:
                 case {"move": move, "turn": turn}:
-                    self.pilot.steer(_clamp(move, _FASTEST), _clamp(turn, _TURNING))
+                    self.pilot.steer(_clamp_each(move, _FASTEST), _clamp_each(turn, _TURNING))
                 case {"formation": str(name)} if name in self.pilot.formations:
                     self.pilot.change_formation(name)
                 case {"gust": direction, "strength": strength}:
                     strength = _clamped_number(strength, _STRONGEST)
-                    direction = _clamp(direction, 1.0)
+                    direction = _clamp_each(direction, 1.0)
                     if not np.linalg.norm(direction) > 0.0:  # the square of a tiny one is 0
                         raise ValueError("a gust needs a direction")
                     self.pilot.send_gust(direction, strength)
                 case {"ball": place, "radius": radius, "velocity": velocity}:
-                    place, velocity = _clamp(place, _FARTHEST), _clamp(velocity, _FASTEST)
+                    place, velocity = _clamp_each(place, _FARTHEST), _clamp_each(velocity, _FASTEST)
                     self.pilot.add_ball(place, _clamped_number(radius, _FARTHEST), velocity)
                 case {"pull": int(slot), "to": place}:
-                    goal = None if place is None else _clamp(place, _FARTHEST)
+                    goal = None if place is None else _clamp_each(place, _FARTHEST)
                     self.pilot.pull_ball(slot, goal)
                 case {"remove": int(slot)}:
                     self.pilot.remove_ball(slot)
@@ -274,7 +274,7 @@ def _clamped_number(value: Any, most: float) -> float:
     return float(min(max(value, -most), most))
 
 
-def _clamp(value: Any, most: float) -> np.ndarray:
+def _clamp_each(value: Any, most: float) -> np.ndarray:
     if not isinstance(value, list) or len(value) != 3:
         raise ValueError("the value must be a list of three numbers")
     return np.array([_clamped_number(x, most) for x in value])
