@@ -401,6 +401,27 @@ def test_singular_values_of_triangles_are_right_however_flat():
         assert constraint_jacobian.smallest_singular_value(r[[k]], edges)[0] == found[k]
 
 
+@pytest.mark.parametrize(
+    "points",
+    [
+        [[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]],  # from one agent, at equal angles
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],  # at right angles
+        [[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]],  # on a line: two eigenvalues are zero
+    ],
+)
+@pytest.mark.parametrize("edges", [[[0, 1], [0, 2], [3, 0]], [[0, 1], [2, 1], [2, 3]]])
+def test_singular_values_of_three_edges_are_right_where_some_are_equal(points, edges):
+    """The least eigenvalue is exact to rounding where it is a double one, and however near to that."""
+    rng = np.random.default_rng(4)
+    off = np.array([0, 1e-300, 1e-16, 1e-12, 1e-8, 1e-4])
+    r = np.array(points) + off[:, None, None] * rng.normal(size=(6, 4, 3))
+    found = constraint_jacobian.smallest_singular_value(r, np.array(edges))
+    for k in range(6):
+        values = np.linalg.svd(jacobian(r[k], edges), compute_uv=False)
+        least = values[values > 1e-7 * values[0]].min()
+        assert found[k] ** 2 == pytest.approx(least**2, rel=0, abs=5e-15)
+
+
 def test_weighted_singular_values_are_those_of_the_law():
     """With masses, the squares are the eigenvalues of mbar J M^-1 J^T, which the solvers see."""
     rng = np.random.default_rng(0)

@@ -27,8 +27,9 @@ _ASKED = 256
 CACHED = 60_000
 
 
-#: Number of points for which a surface of triangles is searched at once: near ones need the same triangles.
-_TOGETHER = 256
+#: Number of points for which a surface of triangles is searched at once, those of each sample together: near ones need
+#: the same triangles.
+_TOGETHER = 2048
 
 
 #: Kinds of solids whose distance takes a search of triangles.
@@ -302,12 +303,13 @@ def distances(
         x, y, z = x - shift[0], y - shift[1], z - shift[2]
     x, y, z = distance.local_point(x, y, z, 0, solid)
     if solid.kind[0] in _SURFACES:
-        away = np.full(x.shape, np.inf)
-        near = np.flatnonzero((distance.box_distance(x, y, z, solid.size[0]) < most).reshape(-1))
-        points, flat = np.stack([x, y, z]).reshape(3, -1), away.reshape(-1)
+        away = np.full(x.shape[::-1], np.inf)
+        near = np.flatnonzero((distance.box_distance(x, y, z, solid.size[0]) < most).T)
+        points, flat = np.stack([x.T, y.T, z.T]).reshape(3, -1), away.reshape(-1)
         for first in range(0, len(near), _TOGETHER):
             some = near[first : first + _TOGETHER]
             flat[some] = distance.signed_distance(*points[:, some], 0, solid)
+        away = away.T
     else:
         away = distance.signed_distance(x, y, z, 0, solid)
     if not any(map(math.isfinite, solid.there[0].tolist())):
