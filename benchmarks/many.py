@@ -31,7 +31,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rigidfleet.assessment import assess
-from rigidfleet.assessment.fits import fits_by_sample
+from rigidfleet.assessment.fits import fits_by_sample, shape_of_slots
 from rigidfleet.formation import distance_geometry, shapes
 from rigidfleet.formation.graphs import GRAPHS as DESIGNS
 from rigidfleet.math import proximity, rigid_body
@@ -221,7 +221,7 @@ def fly(kind: str, n: int) -> Flown:
         result = simulate(flown, force=force, max_step=DURATION)
         times.append((time.perf_counter() - wall, time.process_time() - processor))
     last = result.position[-1]
-    fit = next(fits_by_sample(last[None], slots, np.arange(n), float))
+    fit = next(fits_by_sample(last[None], shape_of_slots(slots), np.arange(n), float))
     error = np.abs(distance_geometry.distances(last, edges) - flown.formation_distances("f")).max()
     thickness = np.linalg.svd(rigid_body.centred(last), full_matrices=False)[2][2]
     off = rigid_body.centred(last) @ thickness

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from rigidfleet._common.waypoints import SHAPE_TOLERANCE
 from rigidfleet.assessment import Verdict, assess
-from rigidfleet.assessment.fits import Fit, fits_by_sample
+from rigidfleet.assessment.fits import Fit, fits_by_sample, shape_of_slots
 from rigidfleet.assessment.verdict import CheckResult
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import attitude as att
@@ -807,7 +807,7 @@ def test_judging_is_light():
 
 def _fit(p: Floats, slots: Floats) -> Fit:
     """The fit of slots to agents (N, 3) at one sample."""
-    return next(fits_by_sample(p[None], slots, np.arange(len(p)), float))
+    return next(fits_by_sample(p[None], shape_of_slots(slots), np.arange(len(p)), float))
 
 
 @pytest.mark.parametrize("flown", ["near", "mirrored", "larger", "exchanged", "scattered"])

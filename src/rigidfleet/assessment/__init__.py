@@ -57,7 +57,7 @@ def assess(result: Result | str | Path) -> Verdict:
     """
     result = as_result(result)
     measured = Measurements(result)
-    phases = [measured.phase_verdict(i, record) for i, record in enumerate(result.phases)]
+    phases = [*measured.phase_verdicts()]
     names = ", ".join(f"'{p.name}'" for p in result.phases if p.controller is False)
     uncalled = names and f"the controller was not called in {names}, as no slots are tracked there"
     covers, n = "", result.n_agents

@@ -6,11 +6,10 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from itertools import repeat
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet.formation import distance_geometry
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.result.quantities import norms
@@ -31,6 +30,11 @@ _ROUNDING = 1e-12
 
 #: Greatest number of agents for which a wrong shape is tested for rigidity.
 _JUDGED = 200
+
+
+#: Slots (N, 3), the same about their centre, dimension and axis of `Fit`, order on a line, distances (P,) of all pairs
+#: of few agents, shortest distance [m].
+SlotShape = tuple[Floats, Floats, int, Floats, list[int], Floats, float]
 
 
 class Fit(NamedTuple):
@@ -59,19 +63,19 @@ class Fit(NamedTuple):
 
 
 def fits_by_sample(
-    p: Floats, slots: Floats, who: Ints, error_limit: Callable[[float], float]
+    p: Floats, shape: SlotShape, who: Ints, error_limit: Callable[[float], float]
 ) -> Iterator[Fit]:
-    """Compare a formation as flown at G samples with its slots (N, 3): agents ``who`` (N,) at p (G, N, 3).
+    """Compare a formation as flown at G samples with the shape of its slots: agents ``who`` (N,) at p (G, N, 3).
 
     ``error_limit``: the one that is allowed [m], of the shortest distance of two slots [m].
     """
-    dimension, axis, order, shortest = _shape_properties(slots)
-    own, centred = p - p.mean(axis=1, keepdims=True), rigid_body.centred(slots)
+    slots, centred, dimension, axis, order, distances, shortest = shape
+    own = p - p.mean(axis=1, keepdims=True)
     # The decompositions of the sums of p slot^T over the agents.
     u, s, vt = np.linalg.svd(own.swapaxes(1, 2) @ centred)
     turn, proper = rigid_body.best_rotation(u, s, vt)
-    if len(slots) <= _FEW:
-        worst = _worst_pair_errors(p, slots)
+    if distances.size:
+        worst = _worst_pair_errors(p, distances)
     else:
         worst = map(_worst_error, p, repeat(slots), norms(own - centred @ (u @ vt).swapaxes(1, 2)))
     in_order: list[bool | None] = [None] * len(p)
@@ -87,24 +91,37 @@ def fits_by_sample(
         yield Fit(dimension, axis, limit, error, pair, apart, intended, mirrored, place, ordered)
 
 
-def _shape_properties(slots: Floats) -> tuple[int, Floats, list[int], float]:
-    """Of slots (N, 3): dimension, axis of `Fit`, order on a line, shortest distance [m]."""
-    centred = rigid_body.centred(slots)
-    dimension = distance_geometry.dimension(centred, THIN)
-    axes = np.linalg.svd(centred, full_matrices=False)[2]
+def shape_of_slots(slots: Floats) -> SlotShape:
+    """What a formation as flown is compared with, of slots (N, 3) of two agents or more."""
+    centred, few = rigid_body.centred(slots), len(slots) <= _FEW
+    _, extents, axes = np.linalg.svd(centred, full_matrices=False)
+    dimension = int(np.count_nonzero(extents > THIN * extents[0]))
     axis = axes[0] if dimension == 1 else axes[2]
     order = (centred @ axis).argsort().tolist() if dimension == 1 else []
-    return dimension, axis, order, float(proximity.nearest(slots).min())
+    apart = _pair_distances(slots) if few else np.empty(0)
+    shortest = float((apart if few else proximity.nearest(slots)).min())
+    return slots, centred, dimension, axis, order, apart, shortest
+
+
+def formation_shape(mission: Any, name: str, *who: int) -> SlotShape | None:
+    """The shape of the slots of the agents ``who`` in a formation; None without slots, or of one agent alone."""
+    slots = mission.formation_slots(name)
+    return None if slots is None or len(who) < 2 else shape_of_slots(slots[list(who)])
+
+
+def _pair_distances(p: Floats) -> Floats:
+    """Distances (..., P) [m] of all pairs of few agents p (..., N, 3)."""
+    i, j = proximity.all_pairs(p.shape[-2])
+    return norms(p.take(i, axis=-2) - p.take(j, axis=-2))
 
 
 #: Error of a distance [m], of which two, the distances flown and intended [m].
 _Worst = tuple[float, int, int, float, float]
 
 
-def _worst_pair_errors(p: Floats, slots: Floats) -> Iterator[_Worst]:
-    """Worst errors of a distance at samples p (G, N, 3), among all pairs; of equal errors the first."""
-    i, j = proximity.all_pairs(len(slots))
-    flown, intended = (norms(x.take(i, axis=-2) - x.take(j, axis=-2)) for x in (p, slots))
+def _worst_pair_errors(p: Floats, intended: Floats) -> Iterator[_Worst]:
+    """Worst errors of all pairs, ``intended`` (P,) apart, at samples p (G, N, 3); of equal errors the first."""
+    (i, j), flown = proximity.all_pairs(p.shape[1]), _pair_distances(p)
     error = np.abs(flown - intended)
     least = error.max(axis=1, keepdims=True) - _ROUNDING * intended.max()
     k, at = (error >= least).argmax(axis=1), np.arange(len(p))

@@ -11,11 +11,11 @@ from itertools import pairwise
 import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, Quantity, quantity
-from rigidfleet.assessment.fits import Fit, degrees_between, fits_by_sample
+from rigidfleet.assessment.fits import Fit, degrees_between, fits_by_sample, formation_shape
 from rigidfleet.assessment.verdict import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
-from rigidfleet.result import PAD, Extremum, PhaseRecord, Result
+from rigidfleet.result import PAD, Extremum, Result
 from rigidfleet.result.quantities import (
     SAMPLED,
     Samples,
@@ -51,11 +51,14 @@ class Measurements:
         #: Samples of each phase.
         ends = np.searchsorted(result.phase, np.arange(len(result.phases) + 1))
         self.parts = [slice(*pair) for pair in pairwise(ends.tolist())]
-        #: Phases that have samples.
+        #: Phases that have samples, and the last sample of each.
         self.flown = [k for k, s in enumerate(self.parts) if s.stop > s.start]
+        self.last = [self.parts[k].stop - 1 for k in self.flown]
         #: Quantities of which the record tells what happens between samples.
         self.names_recorded = set[str]().union(*(p.extremes for p in result.phases))
+        self._starts = ends[self.flown]
         self._sampled: dict[str, Samples] = {}
+        self._worst_ranks: dict[str, list[float]] = {}
 
     @cached_property
     def closeness(self) -> proximity.Closeness:
@@ -122,26 +125,27 @@ class Measurements:
     def worst_by_phase(self) -> list[dict[str, Extreme]]:
         """The worst values of each phase, at its samples or between them, by name."""
         every: list[dict[str, Extreme]] = [{} for _ in self.parts]
+        phases = [*zip(self.result.phases, self.parts, every, strict=True)]
         for q in (q for q in QUANTITIES.values() if q.by_phase):
-            sampled, alone = self.samples_of(q.name), q.name not in self.names_recorded
-            ranks = self.worst_ranks(q.name)
-            for k, (phase, worst) in enumerate(zip(self.result.phases, every, strict=True)):
-                x, rank, e = phase.extremes.get(q.name), ranks[k], None
+            name, ranks, sampled = q.name, self.worst_ranks(q.name), self.samples_of(q.name)
+            alone = name not in self.names_recorded
+            for (phase, part, worst), rank in zip(phases, ranks, strict=True):
+                x = phase.extremes.get(name)
                 if x is not None and (rank == -math.inf or rank < q.rank(_in_unit(q, x))):
-                    e = self.extreme_of(q.name, x, phase.name)
-                elif rank > -math.inf:
-                    e = self.worst_sample(sampled, self.parts[k], alone=alone)
-                if e is not None:
-                    worst[q.name] = e
+                    worst[name] = self.extreme_of(name, x, phase.name)
+                elif (e := self.worst_sample(sampled, part, alone=alone)) is not None:
+                    worst[name] = e
         return every
 
     def worst_ranks(self, name: str) -> list[float]:
         """Rank of the worst sample of a quantity in each phase; -infinity if none is finite."""
-        rank, worst = self.samples_of(name).rank, np.full(len(self.parts), -np.inf)
-        if rank.size:
-            starts = [self.parts[k].start * rank.shape[1] for k in self.flown]
-            worst[self.flown] = np.maximum.reduceat(rank.reshape(-1), starts)
-        return worst.tolist()
+        if name not in self._worst_ranks:
+            rank, worst = self.samples_of(name).rank, np.full(len(self.parts), -np.inf)
+            if rank.size:
+                starts = self._starts * rank.shape[1]
+                worst[self.flown] = np.maximum.reduceat(rank.reshape(-1), starts)
+            self._worst_ranks[name] = worst.tolist()
+        return self._worst_ranks[name]
 
     def first_contact(self, name: str, e: Extreme) -> Extreme | None:
         """The first contact of agents ("separation") or with an obstacle ("clearance"), of which e is the worst."""
@@ -199,7 +203,7 @@ class Measurements:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
         r = result.position
-        rounding = 1e-9 * (1.0 + float(np.nanmax(np.abs(r), initial=0.0)))
+        rounding = 1e-9 * (1.0 + float(np.fmax.reduce(np.abs(r), axis=None, initial=0.0)))
         stored = {}
         with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
             for name in ("separation", "clearance"):
@@ -235,10 +239,8 @@ class Measurements:
                     e = self.worst_sample(self.samples_of(name), part)
                     assert e is not None
                     words = (
-                        f"its worst {name.replace('_', ' ')} of phase '{phase.name}' is given as"
-                    )
-                    words += (
-                        f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(e.value)}"
+                        f"its worst {name} of phase '{phase.name}' is given as {value(x.value)} at {x.time:.2f} s,"
+                        f" but a sample shows {value(e.value)}"
                     )
                     yield words, e.when
 
@@ -253,39 +255,27 @@ class Measurements:
         there = (thing.solid.there[0] for thing in self.mission.obstacles)
         return any(a < phase.t_end - 1e-9 and b > phase.t_start + 1e-9 for a, b in there)
 
-    def phase_verdict(self, index: int, record: PhaseRecord) -> PhaseVerdict:
-        """Numbers of a phase."""
-        result, fit, waypoints = self.result, self.fits_at_end.get(index), self.waypoint_misses
-        finished = index in self.flown and (result.complete or index < len(result.phases) - 1)
-        return PhaseVerdict(
-            **{key: getattr(record, key) for key in _OF_RECORD},
-            finished=finished and not record.abandoned,
-            constraint=_greatest_size(result.constraint[self.parts[index]][-1:]),
-            distances=self.shape_errors_at_end.get(index),
-            shape=None if fit is None else fit.error,
-            handedness=None if fit is None or fit.dimension < 3 else not fit.is_mirrored,
-            flip=self.axis_errors_at_end.get(index),
-            order=None if fit is None else fit.in_order,
-            waypoint=waypoints.get((index, "target")),
-            stay=waypoints.get((index, "stay")),
-            through=tuple(
-                w for (k, what), w in waypoints.items() if k == index and what not in _ENDS
-            ),
-            worst=self.worst_by_phase[index],
-        )
-
-    @cached_property
-    def last(self) -> list[int]:
-        """The last sample of each phase flown."""
-        return [self.parts[k].stop - 1 for k in self.flown]
-
-    def edges_at_sample(self, formation: str, k: int) -> tuple[Ints, Floats]:
-        """Edges (m, 2) of a formation that are not lost at sample k, and their lengths (m,) [m]."""
-        mission = self.mission
-        edges, intended = mission.formation_edges(formation), mission.formation_distances(formation)
-        kept = self.left[k][edges].all(axis=1)
-        kept &= mission.has_link(edges, float(self.result.time[k]))
-        return edges[kept], intended[kept]
+    def phase_verdicts(self) -> Iterator[PhaseVerdict]:
+        """Numbers of each phase."""
+        result, off = self.result, _greatest_sizes(self.result.constraint[self.last])
+        constraint_errors = dict(zip(self.flown, off, strict=True))
+        for index, record in enumerate(result.phases):
+            fit, waypoints = self.fits_at_end.get(index), self.waypoint_misses.get(index, {})
+            finished = index in self.flown and (result.complete or index < len(result.phases) - 1)
+            yield PhaseVerdict(
+                **{key: getattr(record, key) for key in _OF_RECORD},
+                finished=finished and not record.abandoned,
+                constraint=constraint_errors.get(index),
+                distances=self.edges_at_end.get(index, (None, None))[1],
+                shape=None if fit is None else fit.error,
+                handedness=None if fit is None or fit.dimension < 3 else not fit.is_mirrored,
+                flip=self.axis_errors_at_end.get(index),
+                order=None if fit is None else fit.in_order,
+                waypoint=waypoints.get("target"),
+                stay=waypoints.get("stay"),
+                through=tuple(w for what, w in waypoints.items() if what not in _ENDS),
+                worst=self.worst_by_phase[index],
+            )
 
     @cached_property
     def _ends_alike(self) -> list[tuple[str, list[int], list[int]]]:
@@ -300,26 +290,31 @@ class Measurements:
         return [(str(key[0]), *phases) for key, phases in alike.items()]
 
     @cached_property
-    def shape_errors_at_end(self) -> dict[int, float | None]:
-        """Greatest error [m] of an edge against the formation at the end of each phase that has one."""
-        errors: dict[int, float | None] = {}
+    def edges_at_end(self) -> dict[int, tuple[Ints, float | None]]:
+        """Edges (m, 2) that are not lost at the end of each phase with a formation, and the greatest error [m]."""
+        mission, ends = self.mission, {}
         for name, indices, last in self._ends_alike:
-            edges, intended = self.edges_at_sample(name, last[0])
-            off = proximity.pair_distances(self.result.position[last], edges).T - intended
-            errors.update(zip(indices, map(_greatest_size, off), strict=True))
-        return errors
+            edges, intended = mission.formation_edges(name), mission.formation_distances(name)
+            kept = self.left[last[0]][edges].all(axis=1)
+            kept &= mission.has_link(edges, float(self.result.time[last[0]]))
+            edges = edges[kept]
+            off = proximity.pair_distances(self.result.position[last], edges).T - intended[kept]
+            ends.update(zip(indices, ((edges, x) for x in _greatest_sizes(off)), strict=True))
+        return ends
 
     @cached_property
     def fits_at_end(self) -> dict[int, Fit]:
         """Fits of the formations at the end of each phase that has one."""
+        from rigidfleet.mission.model import part_of_mission  # takes long to load
+
         mission, fits = self.mission, {}
         for name, indices, last in self._ends_alike:
-            left, slots = np.flatnonzero(self.left[last[0]]), mission.formation_slots(name)
-            p = self.result.position[last]
+            left, p = np.flatnonzero(self.left[last[0]]), self.result.position[last]
+            shape = part_of_mission(mission, formation_shape, name, *left.tolist())
             known = np.flatnonzero(np.isfinite(p).all(axis=(1, 2))).tolist()
-            if slots is not None and len(left) > 1 and known:
+            if shape is not None and known:
                 most = mission.formations[name].greatest_error
-                each = fits_by_sample(p[known][:, left], slots[left], left, most)
+                each = fits_by_sample(p[known][:, left], shape, left, most)
                 fits.update(zip([indices[k] for k in known], each, strict=True))
         return fits
 
@@ -348,7 +343,7 @@ class Measurements:
         return after if abs(time[after] - t) < abs(time[before] - t) else before
 
     @cached_property
-    def waypoint_misses(self) -> dict[tuple[int, str], Waypoint]:
+    def waypoint_misses(self) -> dict[int, dict[str, Waypoint]]:
         """Misses of the "target" of each phase, of its place to "stay", and of the points to pass on the way.
 
         A target is due at its time, or at the end of a phase that settles earlier; of the others, those that the
@@ -374,14 +369,14 @@ class Measurements:
             turned = name == "attitude"
             off = att.angle_between(values[at], aims) if turned else norms(values[at] - aims)
             rows.append(np.degrees(off) if turned or name == "rates" else off)
-        misses: dict[tuple[int, str], Waypoint] = {}
+        misses: dict[int, dict[str, Waypoint]] = {}
         for (index, what, _), k, row in zip(due, at, np.transpose(rows).tolist(), strict=True):
             miss = [x if math.isfinite(x) else None for x in row]
             if miss[0] is not None and what in _ENDS and result.phases[index].formation is None:
                 own = float(np.fmax.reduce(self.samples_of("tracking_error").values[k]))
                 # With a vehicle lost, the centre of those left says nothing of their places.
                 miss[0] = max(miss[0], own) if self.left[k].all() else own
-            misses[index, what] = Waypoint(result.time.item(k), *miss)
+            misses.setdefault(index, {})[what] = Waypoint(result.time.item(k), *miss)
         return misses
 
 
@@ -390,6 +385,7 @@ def _in_unit(q: Quantity, x: Extremum) -> float:
     return abs(x.value) if q.name == "constraint" else q.scale * x.value
 
 
-def _greatest_size(values: Floats) -> float | None:
-    """Greatest finite size of some values; None if there is none."""
-    return max(np.abs(values[np.isfinite(values)]).tolist(), default=None)
+def _greatest_sizes(values: Floats) -> list[float | None]:
+    """Greatest finite size of each row of values (G, m); None if there is none."""
+    sizes = np.where(np.isfinite(values), np.abs(values), -1.0).max(axis=1, initial=-1.0)
+    return [None if size < 0.0 else size for size in sizes.tolist()]

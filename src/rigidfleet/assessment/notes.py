@@ -15,6 +15,8 @@ from rigidfleet.assessment.verdict import DIP, FLIPPED, PhaseVerdict, value
 
 #: A speed [m/s] and an extent [m] from which units are doubted.
 _FAST, _WIDE = 100.0, 20_000.0
+#: Clearance from which on a vehicle stands on nothing, whatever its size [m].
+_AWAY = 1.0
 #: Greatest number of vehicles whose names are listed.
 _NAMED = 20
 
@@ -37,7 +39,10 @@ def verdict_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
             who = agent_names(np.flatnonzero(full.any(axis=0)))
             since = measured.first_time(full.max(axis=1))
             yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
-    if words := measured.mission.landing_swaps_in_words(measured.result.position[-1]):
+    # A vehicle stands on nothing that is farther away; those that are lost are not measured.
+    result = measured.result
+    near = ~(measured.closeness.each[-1] > _AWAY) | ~measured.left[-1]
+    if near.any() and (words := result.mission.landing_swaps_in_words(result.position[-1])):
         yield words
     yield from clock_notes(measured.result)
     yield from avoidance_notes(measured)

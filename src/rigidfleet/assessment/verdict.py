@@ -283,9 +283,10 @@ class Verdict(Shown):
         """Each check by its name; of those that several phases fail, the one with the worst value."""
         by_name: dict[str, CheckResult] = {}
         for check in self.checks:
-            rank, known = quantity(check.check).rank, by_name.setdefault(check.check, check)
-            if check.worst is not None and known.worst is not None:
-                by_name[check.check] = max(known, check, key=lambda c: rank(c.worst))
+            known = by_name.setdefault(check.check, check)
+            if known is not check and None not in (check.worst, known.worst):
+                rank = quantity(check.check).rank
+                by_name[check.check] = max(known, check, key=lambda c, rank=rank: rank(c.worst))
         return by_name
 
     @property

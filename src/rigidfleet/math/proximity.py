@@ -51,9 +51,9 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
     Parameters: r (K, N, 3) [m], radius (N,) [m]. For a single agent: infinity and (-1, -1).
     """
     radius = np.asarray(radius, dtype=float)
-    left: Bools = np.logical_and.reduce(np.isfinite(r), axis=2)
-    if not left.all():  # agents without a position do not affect the others
-        return separation_of_remaining(r, radius, left)
+    known = np.isfinite(r)
+    if not known.all():  # agents without a position do not affect the others
+        return separation_of_remaining(r, radius, np.logical_and.reduce(known, axis=2))
     if r.shape[1] > _MANY:
         return _closest_pair_of_many(r, radius)
     return _least_of_pairs(r, radius, lambda d, radii: root_of_squares(d) - radii)
@@ -68,7 +68,7 @@ def _least_of_pairs(
     Infinity is of no pair, (-1, -1).
     """
     least, pair = np.full(len(r), np.inf), np.full((2, len(r)), -1)
-    x, samples = np.ascontiguousarray(r.T), np.arange(len(r))  # rows of samples are faster
+    x = np.ascontiguousarray(r.T)  # rows of samples are faster
     pairs = all_pairs(r.shape[1])
     some = max(1, CACHED // max(1, 3 * len(r)))
     for first in range(0, pairs.shape[1], some):
@@ -76,11 +76,11 @@ def _least_of_pairs(
         d = x.take(j, axis=1)
         d -= x.take(i, axis=1)
         values = measure(d, (radius[i] + radius[j])[:, None])
-        at = values.argmin(axis=0)
-        value = values[at, samples]
+        value = values.min(axis=0)
         closer = value < least
-        np.copyto(least, value, where=closer)
-        np.copyto(pair, part.take(at, axis=1), where=closer)
+        if closer.any():
+            np.copyto(least, value, where=closer)
+            np.copyto(pair, part.take(values.argmin(axis=0), axis=1), where=closer)
     return least, pair.T
 
 

@@ -31,7 +31,7 @@ class Samples:
     def __init__(self, q: Quantity, values: Floats, owner: Owner = lambda _k, i: (i, -1)) -> None:
         self.quantity, self.values, self.owner = q, values, owner
         rank = q.rank(values)
-        if not np.isfinite(rank).all():
+        if not rank.max(initial=-np.inf) < np.inf:  # nor is NaN
             rank = np.where(np.isfinite(rank), rank, -np.inf)
         self.rank = rank.reshape(len(rank), -1)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet.assessment.fits import fits_by_sample
+from rigidfleet.assessment.fits import fits_by_sample, shape_of_slots
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission
 from rigidfleet.mission.bounds import LENGTH, SPEED
@@ -129,7 +129,7 @@ def _failures_and_metrics(
         slots = mission.formation_slots(formation)
         if slots is None or len(slots) < 2:
             continue
-        fits = [*fits_by_sample(r, slots, np.arange(len(slots)), allowed)]
+        fits = [*fits_by_sample(r, shape_of_slots(slots), np.arange(len(slots)), allowed)]
         metrics["shape_end"] = error = np.array([fit.error for fit in fits])
         metrics["shape"] = np.fmax(metrics["shape"], error)
         misshapen = error > fits[0].limit

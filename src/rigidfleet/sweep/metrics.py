@@ -102,7 +102,8 @@ def measure_metrics(result: Result, verdict: Verdict) -> dict[str, float]:
         worst["saturation"] /= 100.0
     # Of clearances, those of vehicles that stand on an obstacle count, too.
     worst |= {name: e.value for name, e in verdict.worst.items() if name != "thrust"}
-    return {name: float((worst | values).get(name, math.nan)) for name in METRICS}
+    worst |= values
+    return {name: float(worst.get(name, math.nan)) for name in METRICS}
 
 
 def _greatest_known(values: Iterable[float | None]) -> float:
