@@ -140,6 +140,9 @@ def jacobi_eigen(A, V, w):
                     x, y = V[k, p], V[k, q]
                     V[k, p] = c * x - s * y
                     V[k, q] = s * x + c * y
+                # Zero but for rounding, which would keep `off` above its bound: all sweeps would be run.
+                A[p, q] = 0.0
+                A[q, p] = 0.0
     largest = A[0, 0]
     for i in range(n):
         w[i] = A[i, i]
