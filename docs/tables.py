@@ -16,7 +16,7 @@ from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
 from rigidfleet.math.margins import (
     Lag,
     LoopGains,
-    formation_loops,
+    distinct_formation_loops,
     largest_stable_pole,
     stability_margins,
     tracking_loops,
@@ -242,7 +242,7 @@ def _margins() -> str:
     for name, (k_R, k_omega, tau) in VEHICLES.items():
         for delay in (0.0, 0.02, 0.05):
             lag = Lag(k_R, k_omega, tau, delay, rate=500.0)
-            loops = formation_loops(p, [[0, 1], [0, 2], [1, 2]], [1.0] * 3, law, [lag] * 3)
+            loops = distinct_formation_loops(p, [[0, 1], [0, 2], [1, 2]], [1.0] * 3, law, [lag] * 3)
             held, alone = (
                 stability_margins(loops, law),
                 stability_margins(tracking_loops([lag]), law),

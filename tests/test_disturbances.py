@@ -8,7 +8,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from rigidfleet import assess, simulate
-from rigidfleet.kernel.disturbances import spline_value
+from rigidfleet.kernel.disturbances import write_spline_value
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning import disturbances
 from rigidfleet.result import Result
@@ -46,10 +46,10 @@ def test_the_kernels_spline_is_scipys():
     table, out = spline_coefficients(y), np.empty((2, 3))
     reference = CubicSpline(0.3 * np.arange(20), y, bc_type="natural")
     for t in (0.0, 0.123, 0.3, 2.9, 5.6999, 5.7):
-        spline_value(t, 0.3, table, out)
+        write_spline_value(t, 0.3, table, out)
         np.testing.assert_allclose(out, reference(t), atol=1e-12)
     for t, end in ((-1.0, 0), (9.0, -1), (1e300, -1)):
-        spline_value(t, 0.3, table, out)
+        write_spline_value(t, 0.3, table, out)
         np.testing.assert_allclose(out, y[end], atol=1e-12)
 
 
@@ -181,7 +181,7 @@ def test_the_constraint_law_is_not_told():
 
     def force(t, r, v):
         u = np.empty_like(r)
-        spline_value(t, d.gust_step, d.gust, u)
+        write_spline_value(t, d.gust_step, d.gust, u)
         return d.drag[:, None] * (d.wind + u - v)
 
     def worst(result):

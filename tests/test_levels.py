@@ -33,22 +33,22 @@ def test_levels_are_those_of_the_loader():
     runs = set(re.findall(r"(x86-64-v\d) \(supported", listed))
     if "x86-64-v" not in listed:
         pytest.skip("a loader that does not tell")
-    assert set(levels.instruction_levels()) == runs & set(levels.LEVELS)
+    assert set(levels.machine_instruction_levels()) == runs & set(levels.LEVELS)
 
 
 @pytest.fixture
 def machine(monkeypatch):
     """A machine of the lower level, in whose environment no level is fixed."""
     monkeypatch.delenv(levels.KEY, raising=False)
-    monkeypatch.setattr(levels, "instruction_levels", lambda: ("x86-64-v3",))
+    monkeypatch.setattr(levels, "machine_instruction_levels", lambda: ("x86-64-v3",))
 
 
 def test_the_highest_level_is_taken(monkeypatch, machine):
     """Without the key the level is the machine's highest, and where there are no levels, this very machine."""
     assert levels.runnable_instruction_level() == "x86-64-v3"
-    monkeypatch.setattr(levels, "instruction_levels", lambda: levels.LEVELS)
+    monkeypatch.setattr(levels, "machine_instruction_levels", lambda: levels.LEVELS)
     assert levels.runnable_instruction_level() == "x86-64-v4"
-    monkeypatch.setattr(levels, "instruction_levels", tuple)
+    monkeypatch.setattr(levels, "machine_instruction_levels", tuple)
     assert levels.runnable_instruction_level() == levels.HOST
 
 
@@ -137,7 +137,7 @@ def test_the_compiler_serves_the_level(monkeypatch):
         done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
         return done.stdout.split()
 
-    runs = levels.instruction_levels()
+    runs = levels.machine_instruction_levels()
     if not runs:
         pytest.skip("no levels here")
     assert of()[0] == "None"

@@ -13,7 +13,7 @@ from rigidfleet.math.constraint_jacobian import filter_factors, jacobian
 from rigidfleet.math.margins import (
     Lag,
     LoopGains,
-    formation_loops,
+    distinct_formation_loops,
     is_stable,
     largest_stable_pole,
     stability_margins,
@@ -94,7 +94,7 @@ def test_triple_pole_with_a_lag(tau):
     """By Routh, a triple pole is stable behind a first-order lag tau for p < 8 / (9 tau)."""
     r = np.array([[0.0, 0, 1], [0, 0, -1]])
     law = LoopGains(solver="exact")
-    loops = formation_loops(r, [[0, 1]], [1.0, 2.0], law, [Lag(1.0, 5.0, tau)] * 2)
+    loops = distinct_formation_loops(r, [[0, 1]], [1.0, 2.0], law, [Lag(1.0, 5.0, tau)] * 2)
     (held,) = [loop for loop in loops if loop.has_constraint_law]
     assert largest_stable_pole([held], law) == pytest.approx(8 / (9 * tau), rel=1e-3)
 
@@ -108,7 +108,7 @@ def test_weak_shapes_without_tracking(k):
     w = np.linalg.eigvalsh(jacobian(r, edges) @ jacobian(r, edges).T)[0]
     sigma = w / (w + 0.1)
     assert 0.05 < sigma < 1 / 9
-    loops = formation_loops(r, edges, np.ones(3), law, [Lag(point=True)] * 3)
+    loops = distinct_formation_loops(r, edges, np.ones(3), law, [Lag(point=True)] * 3)
     expected = 3 * k * (1 - sigma) / (1 - 9 * sigma)
     assert largest_stable_pole(loops, law) == pytest.approx(expected, rel=3e-3)
 
@@ -122,7 +122,7 @@ def test_margins_are_those_of_python_control(lag, delay, constrained):
     if constrained:
         # Side by side, a distance holds horizontal motion alone.
         r = np.array([[1.0, 0, 0], [-1, 0, 0]])
-        loops = formation_loops(r, [[0, 1]], [1, 1], law, [delayed(lag, delay)] * 2)
+        loops = distinct_formation_loops(r, [[0, 1]], [1, 1], law, [delayed(lag, delay)] * 2)
         loops = [loop for loop in loops if loop.has_constraint_law]
         pid = [2 * law.alpha, law.beta**2, law.gamma]
     else:
@@ -166,7 +166,7 @@ def test_parts_are_the_whole():
             k_c, k_u = 2 * law.alpha * s + law.beta**2 + law.gamma / s, law.k1 + law.k2 * s
             G = [lag.response(np.array([s]), vertical=a == 2)[0] for lag in some for a in range(3)]
             whole = np.linalg.eigvals(np.diag(G) @ (k_u * np.eye(24) + (k_c - k_u) * S) / s**2)
-            loops = formation_loops(r, edges, m, law, some)
+            loops = distinct_formation_loops(r, edges, m, law, some)
             parts = np.concatenate(
                 [np.linalg.eigvals(x.gain(np.array([s]), law)[0]) for x in loops]
             )
@@ -182,7 +182,7 @@ def test_heading_does_not_matter_but_attitude_does():
     heading = np.array([math.cos(0.7), math.sin(0.7), 0.0])
     along, turned, tilted, upright = (
         largest_stable_pole(
-            formation_loops(np.array([axis, -axis]), [[0, 1]], np.ones(2), law, lags), law
+            distinct_formation_loops(np.array([axis, -axis]), [[0, 1]], np.ones(2), law, lags), law
         )
         for axis in (np.eye(3)[0], heading, (heading + np.eye(3)[2]) / math.sqrt(2), np.eye(3)[2])
     )
@@ -287,7 +287,7 @@ def test_flights_are_stable_up_to_the_computed_pole(r, masses, lags, law):
     m, edges = np.array([1.0] * n if masses is None else masses), complete_graph(n)
     fleet = [delayed(lags[i % len(lags)], 0.02 + 0.01 * (i % len(lags)), rate) for i in range(n)]
     law = LoopGains(**law)
-    loops = formation_loops(r, edges, m, law, fleet)
+    loops = distinct_formation_loops(r, edges, m, law, fleet)
     p = largest_stable_pole(loops, law)
     for share in (0.97, 1.03):
         some = law.with_triple_pole(share * p)
@@ -300,7 +300,7 @@ def test_delay_margin_is_the_delay_that_flies():
     rate, law, m = 200.0, LoopGains(), np.ones(3)
     edges = complete_graph(3)
     more = stability_margins(
-        formation_loops(TRIANGLE, edges, m, law, [delayed(LIGHT, 0.02, rate)] * 3), law
+        distinct_formation_loops(TRIANGLE, edges, m, law, [delayed(LIGHT, 0.02, rate)] * 3), law
     ).delay
     for share in (0.9, 1.1):
         fleet = [delayed(LIGHT, 0.02 + share * more, rate)] * 3
@@ -333,7 +333,7 @@ def test_check_tells_margins():
     assert words["'triangle' to 'line'"].startswith("stable, more delay ")
     law, slots = LoopGains(damping=0.03), mission.formation_slots("line")
     assert slots is not None
-    alone = formation_loops(
+    alone = distinct_formation_loops(
         slots, mission.formation_edges("line"), np.ones(3), law,
         [delayed(LIGHT, 0.02, 500.0)] * 3,
     )  # fmt: skip

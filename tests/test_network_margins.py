@@ -19,7 +19,7 @@ from rigidfleet.planning.vehicles import lags_by_vehicle
 from rigidfleet.preflight.linear_flight import LinearFlight
 from rigidfleet.preflight.network import (
     greatest_stable_loss,
-    growth_at_delay,
+    growth_rate_at_delay,
     last_stable_delay,
     linear_flights,
     rms_growth,
@@ -177,7 +177,7 @@ def wrong_delays(count: int, least: float, seconds: float) -> list[tuple[int, in
         tables = random_formation(seed)
         linear = linear_flight(still({}, **tables))
         last = last_stable_delay(linear)
-        if (growth := growth_at_delay(linear, last + 1)) < least:
+        if (growth := growth_rate_at_delay(linear, last + 1)) < least:
             continue
         seen += 1
         wrong += [(seed, last)] if last and grows(tables, last, seconds) else []
@@ -197,7 +197,7 @@ def test_the_greatest_growth_is_that_of_the_whole_map(seed, delay):
     _, x = linear.fly(start, sent, 1, delay, lambda k, news: news(0))
     tick = np.concatenate([x, np.roll(sent, -1, axis=0).reshape(-1, whole)])
     radius = np.abs(np.linalg.eigvals(tick)).max()
-    assert growth_at_delay(linear, delay) == pytest.approx(
+    assert growth_rate_at_delay(linear, delay) == pytest.approx(
         np.log(radius) / linear.radio.tick, abs=1e-4
     )
 
@@ -214,8 +214,8 @@ def test_motions_of_the_whole_formation_do_not_count(late):
     )
     linear = linear_flight(still({"delay": 0.04}, phases=[hold], **noise))
     assert linear.is_free
-    assert growth_at_delay(linear, 1) < -1.0
-    assert growth_at_delay(linear, 7) > 1.0
+    assert growth_rate_at_delay(linear, 1) < -1.0
+    assert growth_rate_at_delay(linear, 7) > 1.0
 
 
 @pytest.mark.parametrize("seed", [2, 48])
@@ -223,7 +223,7 @@ def test_the_last_stable_delay_is_the_last_one(seed):
     """Found roughly first, it is where the accurate growth begins: none at it, some at one tick more."""
     linear = linear_flight(still({}, **random_formation(seed)))
     last = last_stable_delay(linear)
-    assert growth_at_delay(linear, last) < GROWTH <= growth_at_delay(linear, last + 1)
+    assert growth_rate_at_delay(linear, last) < GROWTH <= growth_rate_at_delay(linear, last + 1)
 
 
 def test_the_last_stable_delay_flies():

@@ -12,7 +12,7 @@ from rigidfleet.math.pid import matrix_exponential
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import MODELS
 from rigidfleet.preflight.check import check
-from rigidfleet.preflight.offsets import sampled_slot_offsets
+from rigidfleet.preflight.offsets import sampled_tracking_offsets
 from rigidfleet.simulation.flight import simulate
 
 SQUARE = np.array([[2.0, 2, 0], [-2, 2, 0], [-2, -2, 0], [2, -2, 0]])
@@ -125,7 +125,7 @@ def test_wind_on_points_against_the_closed_form():
     blown = mission({"kind": "establish", "formation": "square", "duration": 9.0, "blend": 4.0},
                     disturbances={"wind": [1.2, 0, 0], "drag": 0.5})  # fmt: skip
     found = check(blown, search=False)
-    (off,), t = sampled_slot_offsets(blown, found.planned_phases), found.planned_phases[0].time
+    (off,), t = sampled_tracking_offsets(blown, found.planned_phases), found.planned_phases[0].time
     k1, k2 = blown.tracking_gains
     w = k2 / 2
     assert k1 == pytest.approx(w * w)  # critically damped
@@ -146,7 +146,7 @@ def test_offsets_are_those_flown(model):
     way = check(blown, search=False).planned_phases
     flown = simulate(blown)
     far = 0.0
-    known = list(zip(way, sampled_slot_offsets(blown, way), strict=True))
+    known = list(zip(way, sampled_tracking_offsets(blown, way), strict=True))
     for planned, off in (known[0], *known[2:]):  # a change of shape leaves errors of its own
         inside = (flown.time > planned.time[0]) & (flown.time < planned.time[-1])
         seen = (flown.position - flown.slot_position)[inside]

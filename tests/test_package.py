@@ -307,7 +307,7 @@ def test_workers_fly_the_same_bits_on_a_level(bare):
     folder, run = bare
     vary = ("--vary", "disturbances.mass_error = normal(0, 0.02)", "--runs", "6", "--no-figures")
     flown: dict[str, list[list[tuple[object, ...]]]] = {}
-    for name in levels.instruction_levels():
+    for name in levels.machine_instruction_levels():
         flown[name] = []
         for workers in ("1", "2"):
             out = folder / f"{name}-{workers}"

@@ -357,7 +357,7 @@ def test_flatness():
 
     def desired(t: float) -> np.ndarray:
         out = np.zeros((5, 3))
-        attitude_control.flat_attitude(*given(t), out)
+        attitude_control.write_flat_attitude(*given(t), out)
         return out
 
     h = 1e-3
@@ -410,14 +410,14 @@ def test_attitude_torque_vanishes_on_the_way_and_leads_back():
     T = Rotation.random(rng=rng).as_matrix()
     desired = np.vstack([T, rng.normal(size=(2, 3))])
     tau = np.zeros(3)
-    attitude_control.attitude_torque(T, desired[3], desired, inertia, k_R, k_omega, tau)
+    attitude_control.write_attitude_torque(T, desired[3], desired, inertia, k_R, k_omega, tau)
     motion = inertia * desired[4] + np.cross(desired[3], inertia * desired[3])
     np.testing.assert_allclose(tau, motion, rtol=0, atol=1e-14)
     small = 1e-7 * rng.normal(size=3)
     turned = Rotation.from_rotvec(-small).as_matrix() @ T  # world -> a body turned by `small`
     rest = np.vstack([T, np.zeros((2, 3))])
     omega = 1e-7 * rng.normal(size=3)
-    attitude_control.attitude_torque(turned, omega, rest, inertia, k_R, k_omega, tau)
+    attitude_control.write_attitude_torque(turned, omega, rest, inertia, k_R, k_omega, tau)
     np.testing.assert_allclose(tau, -inertia * (k_R * small + k_omega * omega), rtol=1e-6)
 
 

@@ -13,7 +13,7 @@ from rigidfleet.math import proximity
 from rigidfleet.math.attitude import dcm_from_rotation_vector
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning import ways
-from rigidfleet.planning.clearance import clearance_to, greatest_speeds, speed_bounds
+from rigidfleet.planning.clearance import clearance_to, slot_speed_bounds, speed_bounds
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.lattice import FreeSpace, is_clear
 from rigidfleet.planning.preview import preview_phases
@@ -269,7 +269,7 @@ def test_speeds_between_samples_are_bounded(name):
     """No slot is faster within a span than its bound, and the bounds of short spans are close."""
     for planned in preview_phases(complete_times(load_mission(name)))[0]:
         leg, time = planned.leg, planned.time[::10]
-        bound = greatest_speeds(leg.reference, leg.motion, time[:-1], time[1:])
+        bound = slot_speed_bounds(leg.reference, leg.motion, time[:-1], time[1:])
         inside = time[:-1, None] + np.linspace(0, 1, 7)[1:-1] * np.diff(time)[:, None]
         v = slot_derivatives(leg.reference, leg.motion, inside.ravel(), 2)[:, 1]
         speed = np.linalg.norm(v, axis=-1).reshape(*inside.shape, -1).max(axis=1)

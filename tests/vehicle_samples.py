@@ -51,7 +51,7 @@ def derivatives(
     out, none = np.empty_like(S), np.zeros(3)
     for i in range(len(S)):
         wind = none if air is None else air[i]
-        quadrotor.quadrotor_derivative(
+        quadrotor.write_quadrotor_derivative(
             S[i], command[i], i, flight.vehicles, flight.air, wind, none, np.eye(3), out[i]
         )
     return out

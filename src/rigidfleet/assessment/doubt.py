@@ -73,7 +73,7 @@ class DrawnWays:
     states: Floats
 
     @cached_property
-    def likely_measurements(self) -> Measurements:
+    def likely_flight_measurements(self) -> Measurements:
         """The likely flight."""
         return Measurements(self.result)
 
@@ -103,9 +103,9 @@ class DrawnWays:
         if name == "people":  # where one falls depends on its velocity, for the time of a fall
             height, gravity = np.ptp(self.result.position[..., 2]), self.result.mission.gravity
             return most + math.sqrt(2.0 * height / gravity) * _estimate_greatest_norm(shifts[:, 1])
-        values = -self.likely_measurements.closeness.each if name == "clearance" else None
+        values = -self.likely_flight_measurements.closeness.each if name == "clearance" else None
         if name in SAMPLED and q.who == "agent":
-            values = self.likely_measurements.samples_of(name).rank
+            values = self.likely_flight_measurements.samples_of(name).rank
         if values is None or values.shape != sizes.shape[1:]:
             return most
         # Only what is near the worst value may be the worst in truth.

@@ -184,12 +184,12 @@ def raise_interrupts() -> Generator[None]:
     """Raise KeyboardInterrupt on Ctrl-C even if the compiler turns it into another exception."""
     interrupted = False
 
-    def note_interrupt(*_: object) -> None:
+    def note_and_raise(*_: object) -> None:
         nonlocal interrupted
         interrupted = True
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, note_interrupt)
+    before = signal.signal(signal.SIGINT, note_and_raise)
     try:
         yield
     except Exception:

@@ -139,7 +139,7 @@ def _times_and_epoch(table: TextTable, notes: list[str]) -> tuple[Floats, int | 
         return table.numbers_of_columns(columns)[:, 0], None
     ticks, _ = [], table.factor(columns[0])
     for line, field in zip(table.lines.tolist(), fields, strict=True):
-        if (tick := _parse_seconds(field)) is None:
+        if (tick := _parse_number_or_date(field)) is None:
             why = f"the time {table.names[columns[0]]} is {field[:40] or 'empty'}, neither a finite number nor a date"
             raise fault(why, "Write one, such as 2026-05-01T12:00:00.5Z", line)
         ticks.append(tick)
@@ -159,7 +159,7 @@ def _times_and_epoch(table: TextTable, notes: list[str]) -> tuple[Floats, int | 
     return time + float(since), None
 
 
-def _parse_seconds(field: str) -> Decimal | None:
+def _parse_number_or_date(field: str) -> Decimal | None:
     """A number, or a date as seconds since 1970."""
     if is_number(field):
         plain = Decimal(field.replace(",", "."))
@@ -214,7 +214,7 @@ def read_tracks(
             raise fault(f"{who!r} has no position", "Leave it out")
         velocity, yaw = stack(own.velocity, rows) if own.velocity else None, None
         if own.yaw:
-            yaw = _yaw_unless_doubtful(table, values[own.yaw[0]][rows], time[rows], rows, notes)
+            yaw = _yaw_of_clear_unit(table, values[own.yaw[0]][rows], time[rows], rows, notes)
         elif own.quaternion:
             yaw = yaws_of(stack(own.quaternion, rows))
         turned = _turn_to_enu(own.axes, stack(own.place, rows), velocity, yaw)
@@ -399,7 +399,7 @@ def _turn_to_enu(
     return place @ turn.T, None if velocity is None else velocity @ turn.T, yaw
 
 
-def _yaw_unless_doubtful(
+def _yaw_of_clear_unit(
     table: TextTable, yaw: Floats, time: Floats, rows: Ints, notes: list[str]
 ) -> Floats | None:
     """The yaws (K,) [rad], or None if they may be in another unit than assumed.

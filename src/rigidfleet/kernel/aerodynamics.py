@@ -3,7 +3,7 @@
 import math
 
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
-from rigidfleet.kernel.disturbances import spline_value
+from rigidfleet.kernel.disturbances import write_spline_value
 from rigidfleet.kernel.fleet import downwash_speed
 from rigidfleet.kernel.rigid_body import attitude_matrix
 
@@ -15,12 +15,12 @@ jet = jit_inline(downwash_speed)
 
 
 @jit
-def air_velocity_in_step(t, h, around, out):
+def write_air_velocity_in_step(t, h, around, out):
     """Velocity of the air at each vehicle [m/s] at t, t + h/2 and t + h, into out (3, N, 3)."""
     for s in range(3):
         row = out[s]
         if around.gust.shape[0] > 0:
-            spline_value(t + 0.5 * s * h, around.gust_step, around.gust, row)
+            write_spline_value(t + 0.5 * s * h, around.gust_step, around.gust, row)
         for i in range(row.shape[0]):
             for q in range(3):
                 gust = row[i, q] if around.gust.shape[0] > 0 else 0.0
@@ -28,7 +28,7 @@ def air_velocity_in_step(t, h, around, out):
 
 
 @jit
-def add_downwash(S, vehicles, density, T, out):
+def add_downwash_to_air(S, vehicles, density, T, out):
     """Add to the air (3, N, 3) the jets of all vehicles above, at states S (N, 17).
 
     Each is that of `fleet.downwash_speed`; they add up. T (3, 3) is work.

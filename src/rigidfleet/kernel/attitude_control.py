@@ -35,7 +35,7 @@ def limit_tilt(F, tilt, weight):
 
 
 @jit
-def flat_attitude(F, F_dot, F_ddot, yaw, out):
+def write_flat_attitude(F, F_dot, F_ddot, yaw, out):
     """Attitude, rates and accelerations (5, 3) with the thrust axis along F (3,) and a heading.
 
     Parameters
@@ -78,7 +78,7 @@ def flat_attitude(F, F_dot, F_ddot, yaw, out):
 
 
 @jit
-def attitude_torque(T, omega, desired, inertia, k_R, k_omega, tau):
+def write_attitude_torque(T, omega, desired, inertia, k_R, k_omega, tau):
     """Torque tau (3,) [N m] that leads the attitude T (3, 3) with rates omega (3,) to a desired one (5, 3).
 
     With E = T_d T^T, from body to desired body axes, the errors are e_R = (E - E^T)^v / 2 and
@@ -169,7 +169,7 @@ def write_desired_attitude(k, i, flight, state, F):
         # At the limit of tilt, the force does not follow the reference's jerk
         F_dot[q] = m * tables.jerk[row, i, q] if tables.jerk.shape[0] > 0 and not limited else 0.0
         F_ddot[q] = m * tables.snap[row, i, q] if tables.snap.shape[0] > 0 and not limited else 0.0
-    flat_attitude(F, F_dot, F_ddot, yaw, work.desired)
+    write_flat_attitude(F, F_dot, F_ddot, yaw, work.desired)
 
 
 @jit
@@ -208,7 +208,7 @@ def command_rotors(k, i, flight, state):
     else:
         write_desired_attitude(k, i, flight, state, F)
         thrust = F[0] * T[2, 0] + F[1] * T[2, 1] + F[2] * T[2, 2]
-    attitude_torque(
+    write_attitude_torque(
         T, S[10:13], desired, vehicles.inertia[i], vehicles.k_R[i], vehicles.k_omega[i], tau
     )
     saturated = allocate_rotors(

@@ -50,7 +50,7 @@ needed_rate = jit_inline(_needed_rate)
 
 
 @jit
-def weaken_edge_forces(p, w, state, avoid):
+def weaken_all_edge_forces(p, w, state, avoid):
     """Take from the forces of edges what they let go, and from their integrals what the tick has added to it.
 
     All edges let go by one share, that of the vehicle that is pushed most: where edges are redundant, forces of single

@@ -97,7 +97,7 @@ def halve_curve(piece, left):
 
 
 @jit
-def squared_norm_coefficients(points, sign, out):
+def write_squared_norm_coefficients(points, sign, out):
     """Bernstein coefficients (9,) of sign |r|^2 of a curve with control points (15,)."""
     for k in range(9):
         out[k] = 0.0
@@ -178,7 +178,7 @@ def least_norm_of_curve(to_beat, work, pieces):
         start = norm_at(piece, 0.0)
         if start < best:
             best, at = start, piece[15]
-        squared_norm_coefficients(piece, 1.0, work[0])
+        write_squared_norm_coefficients(piece, 1.0, work[0])
         _, place = least_polynomial_value(work, 8, best * best)
         if place >= 0.0:
             length = norm_at(piece, place)

@@ -53,7 +53,7 @@ def fill_path_tables(k, i, tick, flight, state):
 
 
 @jit
-def neighbour_clock_offset(link, tick_number, tick, mail):
+def neighbour_clock_offset_and_rate(link, tick_number, tick, mail):
     """What the clock of a link's sender differs by from the time at a tick [s] by its newest message, and its rate."""
     rate = mail.heard[link, CLOCK + 1]
     return mail.heard[link, CLOCK] + (tick_number - mail.stamp[link]) * tick * (rate - 1.0), rate
@@ -82,7 +82,7 @@ def advance_clocks(k, tick, flight, state):
         pull, heard = 0.0, 0
         for l in range(net.first[i], net.first[i + 1]):
             if mail.stamp[l] >= 0 and k - mail.stamp[l] <= net.silence:
-                pull += neighbour_clock_offset(l, k, tick, mail)[0] - own[OFF]
+                pull += neighbour_clock_offset_and_rate(l, k, tick, mail)[0] - own[OFF]
                 heard += 1
         # Of the sum, the own clock counts at the end of the tick: stable at any gain
         pull *= clocks.gain / (1.0 + tick * clocks.gain * heard)
@@ -128,7 +128,7 @@ def apply_own_clock(i, k, t, p, w, flight, state):
     for l in range(net.first[i] - 1, net.first[i + 1]):
         j, ahead, pace = i, early, rate
         if l >= net.first[i]:  # a neighbour's slot is where its own clock has it
-            there, pace = neighbour_clock_offset(l, k, tick, mail)
+            there, pace = neighbour_clock_offset_and_rate(l, k, tick, mail)
             j, ahead = net.links[l, 1], early + (there - own[OFF] if mail.stamp[l] >= 0 else 0.0)
         for q in range(3 if tracks else 0):
             v, a = w.v_ref[j, q], w.a_ref[j, q] if early == 0.0 else 0.0
@@ -171,7 +171,7 @@ def write_slots_by_own_clock(p, w, state):
 
 
 @jit
-def drop_constraint_force(i, w, net, state):
+def drop_own_constraint_force(i, w, net, state):
     """Exert no constraint force as vehicle i; its integrals of constraints go on, as its neighbours' do."""
     mail = state.mail
     state.saturated[i] = True  # its own integral rests; steering says anew whether it is

@@ -16,7 +16,7 @@ _CONTACT, _SOFT = 20.0, 0.01
 
 @jit_inline
 def spline_weights(t, step, rows):
-    """First of the four rows of a table of ``rows`` that count at t, and their weights; see `spline_value`."""
+    """First of the four rows of a table of ``rows`` that count at t, and their weights; see `write_spline_value`."""
     last = rows - 4
     x = min(max(t / step, 0.0), last + 1.0)
     j = min(int(x), last)
@@ -28,7 +28,7 @@ def spline_weights(t, step, rows):
 
 
 @jit
-def spline_value(t, step, table, out):
+def write_spline_value(t, step, table, out):
     """Cubic B-spline with coefficients table (K, N, 3), knots every `step` [s] from 0, into out (N, 3).
 
     Twice continuously differentiable; constant before the first and after the last knot.
@@ -56,8 +56,8 @@ def swap_contents(a, b):
 def swap_in_measured_states(t, disturbance, w):
     """Write measured states into w.r and w.v, and store the true ones in w.r_seen and w.v_seen meanwhile."""
     if disturbance.noise_r.shape[0] > 0:
-        spline_value(t, disturbance.noise_step, disturbance.noise_r, w.r_seen)
-        spline_value(t, disturbance.noise_step, disturbance.noise_v, w.v_seen)
+        write_spline_value(t, disturbance.noise_step, disturbance.noise_r, w.r_seen)
+        write_spline_value(t, disturbance.noise_step, disturbance.noise_v, w.v_seen)
         for i in range(w.r.shape[0]):
             for q in range(3):
                 r, v = w.r[i, q], w.v[i, q]
@@ -86,7 +86,7 @@ def restore_states_and_disturb(t, m, g, disturbance, w):
         swap_contents(w.r, w.r_seen)
         swap_contents(w.v, w.v_seen)
     if disturbance.gust.shape[0] > 0:
-        spline_value(t, disturbance.gust_step, disturbance.gust, w.f_D)
+        write_spline_value(t, disturbance.gust_step, disturbance.gust, w.f_D)
     else:
         w.f_D[:] = 0.0
     for i in range(m.shape[0]):

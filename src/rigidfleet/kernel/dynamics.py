@@ -38,7 +38,7 @@ def closed_loop(t, y, dy, p, w):
     if p.has_frame:
         attitude_matrix(y[q : q + 4], T)
     if p.body_formulation:
-        world_states(y, p, w)
+        write_world_states(y, p, w)
     else:
         for i in range(n):
             for s in range(3):
@@ -65,7 +65,7 @@ def closed_loop(t, y, dy, p, w):
             mean_axes(r, v, m, vehicles.M, w)
     write_accelerations(dy, p, w)
     if p.body_formulation:
-        body_frame_derivatives(y, dy, p, w)
+        write_body_frame_derivatives(y, dy, p, w)
     if p.has_frame:
         multiply(T, w.cm[2], w.cm[4])
         quaternion_rate(y[q : q + 4], w.cm[4], dy[q : q + 4])
@@ -95,7 +95,7 @@ def write_accelerations(dy, p, w):
 
 
 @jit
-def world_states(y, p, w):
+def write_world_states(y, p, w):
     """Positions and velocities in world axes from the states of the body formulation: v by Eq. (22)."""
     n = p.vehicles.m.shape[0]
     q = 6 * n + p.graph.edges.shape[0]
@@ -119,7 +119,7 @@ def turn_to_world(T, x, origin, out):
 
 
 @jit
-def body_frame_derivatives(y, dy, p, w):
+def write_body_frame_derivatives(y, dy, p, w):
     """The paper's equations of motion in the body frame, Eqs. (15), (16), in their well-posed form.
 
     The paper's pair for d2x/dt2 and domega/dt is linearly dependent: omega of a deforming body is

@@ -26,7 +26,7 @@ def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, f_C):
         inertia_inverse(I, I_inv)
     pivot = solve_J_agent_by_agent(u, b, order, a)
     if pivot > LOST_PIVOT:
-        balanced_forces(r, m, M, cm, I_inv, a, f_C)
+        write_balanced_forces(r, m, M, cm, I_inv, a, f_C)
     return pivot
 
 
@@ -76,7 +76,7 @@ def solve_J_agent_by_agent(u, b, order, a):
 
 
 @jit_inline
-def balanced_forces(r, m, M, cm, I_inv, accels, out):
+def write_balanced_forces(r, m, M, cm, I_inv, accels, out):
     """Forces (N, 3) of accelerations (N, 3) into ``out``, without the rigid motion that carries their momentum.
 
     The forces then have zero sum, and zero torque about cm, the centre of mass of agents r (N, 3).

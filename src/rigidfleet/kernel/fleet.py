@@ -157,8 +157,8 @@ class Air(NamedTuple):
 
     wind: Floats  # (3,) steady, world [m/s]
     gust_step: float  # between knots [s]
-    gust: Floats  # (K, N, 3) coefficients of cubic B-splines over time [m/s]; see `disturbances.spline_value`
-    downwash: bool  # see `aerodynamics.add_downwash`
+    gust: Floats  # (K, N, 3) coefficients of cubic B-splines over time [m/s]; see `disturbances.write_spline_value`
+    downwash: bool  # see `aerodynamics.add_downwash_to_air`
     ground_effect: bool  # see `aerodynamics.ground_effect_factor`
     density: float  # [kg/m^3]
     ground: float  # height of the ground [m]

@@ -29,13 +29,12 @@ from rigidfleet.kernel.avoidance import (
     PAIR,
     TICKS,
 )
-from rigidfleet.kernel.barriers import filter_accelerations, limit_thrust, weaken_edge_forces
+from rigidfleet.kernel.barriers import filter_accelerations, limit_thrust, weaken_all_edge_forces
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
 from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.linalg import copy, copy_vector
 from rigidfleet.kernel.moving import (
-    braking_relative_to_obstacle,
     is_obstacle_known,
     miss_distance,
     moving_obstacle_margin,
@@ -43,6 +42,7 @@ from rigidfleet.kernel.moving import (
     steer_round_obstacles,
     update_tracks,
     way_to_rest,
+    write_braking_relative_to_obstacle,
     write_stop_relative_to_obstacle,
 )
 from rigidfleet.kernel.rigid_body import attitude_matrix
@@ -98,7 +98,7 @@ def predict_motion(i, r, v, c, avoid, out):
 
 
 @jit
-def braking_acceleration(i, v, avoid, out):
+def write_braking_acceleration(i, v, avoid, out):
     """Acceleration (3,) that brakes vehicle i from a velocity v (3,): by b, or to rest within the tick, with drag."""
     speed, b, soft = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), avoid.b[i], avoid.soft[i]
     most = b * speed / max(speed + soft, 1e-12) if soft > 0.0 else b
@@ -108,7 +108,7 @@ def braking_acceleration(i, v, avoid, out):
 
 
 @jit
-def store_candidate(i, far, avoid):
+def adopt_candidate(i, far, avoid):
     """Make the candidate ``trial`` the present choice of vehicle i."""
     trial = avoid.trial
     avoid.far[i] = far
@@ -355,13 +355,13 @@ def brake_and_set_distances(t, r, v, lost, avoid):
     for i in range(n):
         if is_alone(i, avoid):
             continue
-        braking_acceleration(i, v[i], avoid, c)
+        write_braking_acceleration(i, v[i], avoid, c)
         speed = math.sqrt(v[i, 0] ** 2 + v[i, 1] ** 2 + v[i, 2] ** 2)
         stop = stop_distance(speed, i, avoid)
         for q in range(3):
             avoid.ways[i, 3, q] = r[i, q] + stop / max(speed, 1e-12) * v[i, q]
         # It stays on the stop segment, also after the tick
-        store_candidate(i, max(predict_motion(i, r[i], v[i], c, avoid, avoid.trial), stop), avoid)
+        adopt_candidate(i, max(predict_motion(i, r[i], v[i], c, avoid, avoid.trial), stop), avoid)
     # A vehicle that is nearer than it should be keeps what it has: a floor that nobody meets would stop all.
     for i in range(n):
         if lost[i]:
@@ -429,14 +429,14 @@ def propose_acceleration(i, k, v, avoid, c):
         for q in range(3):
             c[q] = avoid.b[i] * avoid.candidates[k - 1, q]
     else:
-        braking_relative_to_obstacle(i, avoid.threat[i], v, avoid, c)
+        write_braking_relative_to_obstacle(i, avoid.threat[i], v, avoid, c)
 
 
 @jit
 def least_margin_if_braking(i, r, v, too_late, avoid):
     """What `choose_acceleration` compares of vehicle i, if it brakes [m]."""
     c = avoid.trial[3]
-    braking_acceleration(i, v[i], avoid, c)
+    write_braking_acceleration(i, v[i], avoid, c)
     if too_late:
         return miss_distance(r[i], v[i], c, avoid)
     predict_motion(i, r[i], v[i], c, avoid, avoid.trial)
@@ -471,14 +471,14 @@ def choose_acceleration(i, r, v, avoid):
             continue
         best, nearest = away, k
         if k == 0:
-            store_candidate(i, far, avoid)
+            adopt_candidate(i, far, avoid)
             return 0
     if nearest < 0:
         if second < 0 or least_margin_if_braking(i, r, v, late, avoid) >= most:
             return 2
         nearest = second
     propose_acceleration(i, nearest, v_i, avoid, c)
-    store_candidate(i, predict_motion(i, r[i], v_i, c, avoid, avoid.trial), avoid)
+    adopt_candidate(i, predict_motion(i, r[i], v_i, c, avoid, avoid.trial), avoid)
     return 1
 
 
@@ -490,7 +490,7 @@ def count_action(kind, i, t, avoid):
 
 
 @jit
-def command_force(i, state, avoid):
+def set_commanded_force(i, state, avoid):
     """Give vehicle i the force of the acceleration chosen for it; a quadrotor's follows it with a lag."""
     c, u = avoid.chosen[i], avoid.commanded[i]
     for q in range(3):
@@ -560,7 +560,7 @@ def correct_forces(p, w, flight, state, avoid):
     n, lost, t = avoid.b.shape[0], flight.vehicles.lost, state.work.law_time[0]
     r, v, k = avoid.known[0], avoid.known[1], state.count[FLIGHT_TICKS]
     if avoid.filtered:
-        weaken_edge_forces(p, w, state, avoid)
+        weaken_all_edge_forces(p, w, state, avoid)
     write_measured_states(k, r, v, flight, state)
     for i in range(n):
         set_wanted_acceleration(i, state, avoid)
@@ -607,7 +607,7 @@ def correct_forces(p, w, flight, state, avoid):
             avoid.overruled[i] = 1
             if state.layers[i] == 0:
                 state.layers[i] = ACTS[GUARD]
-            command_force(i, state, avoid)
+            set_commanded_force(i, state, avoid)
         elif how > 0 or changed or flows:
-            command_force(i, state, avoid)
+            set_commanded_force(i, state, avoid)
     return 1

@@ -68,7 +68,7 @@ def fit_quaternion(B, bound, K, V, w, q):
     # The eigenvector is a column of the adjugate; the longest one is accurate.
     most = 0.0
     for i in range(4):
-        length = cofactor_row(K, i, V[1])
+        length = write_cofactor_row(K, i, V[1])
         if length > most:
             most = length
             copy_vector(V[1], q)
@@ -89,7 +89,7 @@ def fit_quaternion(B, bound, K, V, w, q):
 
 
 @jit
-def cofactor_row(K, i, out):
+def write_cofactor_row(K, i, out):
     """Row i of the cofactors of K (4, 4) into out (4,); returns the square of their length."""
     a, b, c = K[0], K[1], K[2]
     if i < 3:
@@ -125,7 +125,7 @@ def determinant_4x4(K):
 
 
 @jit
-def quaternion_of(T, q):
+def write_matrix_quaternion(T, q):
     """Unit quaternion q (4,) of a rotation T (3, 3): the longest column of 4 q q^T."""
     a, b, c = T[0, 0], T[1, 1], T[2, 2]
     q0, q1, q2, q3 = 1.0 + a + b + c, 1.0 + a - b - c, 1.0 - a + b - c, 1.0 - a - b + c
@@ -192,7 +192,7 @@ def width_length_and_axis(p, mass, C, V, w, axis):
 
 
 @jit
-def attitude_of_line(x, p, mass, axis, near, T, now, there, across):
+def write_attitude_of_line(x, p, mass, axis, near, T, now, there, across):
     """Attitude T (3, 3) of a line: ``near``, followed by the smallest rotation that lays its axis along the agents."""
     there[:] = 0.0
     for i in range(x.shape[0]):
@@ -237,7 +237,7 @@ def attitude_of_line(x, p, mass, axis, near, T, now, there, across):
 
 
 @jit
-def inertia_inverse_of_line(I, lifted, axis, out):
+def write_inertia_inverse_of_line(I, lifted, axis, out):
     """Pseudo-inverse of an inertia I (3, 3) into out, without the spin of a line about itself.
 
     ``lifted`` (3, 3) and ``axis`` (3,) are scratch.
@@ -245,7 +245,7 @@ def inertia_inverse_of_line(I, lifted, axis, out):
     first = I[0, 0] + I[1, 1] + I[2, 2]
     second = I[0, 0] * I[1, 1] + I[0, 0] * I[2, 2] + I[1, 1] * I[2, 2]
     second -= I[0, 1] * I[0, 1] + I[0, 2] * I[0, 2] + I[1, 2] * I[1, 2]
-    third = eigenvector_of_value(I, 0.0, axis)
+    third = write_eigenvector_of_value(I, 0.0, axis)
     if not second > 0.0:
         out[:] = 0.0
         return
@@ -263,7 +263,7 @@ def inertia_inverse_of_line(I, lifted, axis, out):
         inertia_inverse(I, out)
         return
     # I + largest n n^T, n the axis of the least inertia, has no small eigenvalue.
-    eigenvector_of_value(I, x, axis)
+    write_eigenvector_of_value(I, x, axis)
     for a in range(3):
         for b in range(3):
             lifted[a, b] = I[a, b] + largest * axis[a] * axis[b]
@@ -274,7 +274,7 @@ def inertia_inverse_of_line(I, lifted, axis, out):
 
 
 @jit
-def eigenvector_of_value(I, x, axis):
+def write_eigenvector_of_value(I, x, axis):
     """Unit eigenvector of symmetric I (3, 3) for its simple eigenvalue x, into axis (3,); returns det (I - x)."""
     a, d, f = I[0, 0] - x, I[1, 1] - x, I[2, 2] - x
     b, c, e = I[0, 1], I[0, 2], I[1, 2]
@@ -308,7 +308,7 @@ def measure_slot_attitude(m, sample, is_commanded, line_known, prior, work, T):
     width, length = size[0], size[1]
     line = width <= _THIN * length
     if line or (is_commanded and width <= _NARROW * length):
-        attitude_of_line(x, p, mass, axis, prior, T, work[3, 1], work[3, 2], work[3, 3])
+        write_attitude_of_line(x, p, mass, axis, prior, T, work[3, 1], work[3, 2], work[3, 3])
         if not line:
             off = 0.0
             for i in range(n):
@@ -317,7 +317,7 @@ def measure_slot_attitude(m, sample, is_commanded, line_known, prior, work, T):
                     off += mass[i] * d * d
             line = width <= _SURE * math.sqrt(off)
         if line:
-            quaternion_of(T, m.attitude[sample])
+            write_matrix_quaternion(T, m.attitude[sample])
             return True
     bound = 0.0
     for a in range(3):
@@ -375,15 +375,15 @@ def measure_samples(m):
                 m.attitude[k] = math.nan
             choose_quaternion_sign(m.attitude[k], last[0])
             if not math.isnan(m.T_ref[k, 0, 0]):
-                quaternion_of(m.T_ref[k], m.attitude_reference[k])
+                write_matrix_quaternion(m.T_ref[k], m.attitude_reference[k])
                 choose_quaternion_sign(m.attitude_reference[k], last[1])
             if k == 0 or math.isnan(last[2, 0]):
                 copy_vector(m.frame[k], last[2])
             choose_quaternion_sign(m.frame[k], last[2])
-            angular_momentum(m, k, mass, h)
+            write_angular_momentum(m, k, mass, h)
             inertia(m.x[0], mass, zero, I)
             if line:
-                inertia_inverse_of_line(I, work[8], work[3, 2], inverse)
+                write_inertia_inverse_of_line(I, work[8], work[3, 2], inverse)
             else:
                 inertia_inverse(I, inverse)
             multiply(inverse, h, omega)
@@ -439,7 +439,7 @@ def measure_cm_and_wrench(m, k, mass, M):
 
 
 @jit
-def angular_momentum(m, sample, mass, h):
+def write_angular_momentum(m, sample, mass, h):
     """h = sum m x cross v about the centre of mass at a sample, Eq. (17), into h (3,)."""
     V, v, x = m.cm_velocity[sample], m.v[sample], m.x[0]
     h[0] = h[1] = h[2] = 0.0

@@ -29,9 +29,9 @@ from rigidfleet.kernel.bernstein import (
     least_polynomial_value,
     norm_at,
     point_at,
-    squared_norm_coefficients,
     tangent_of_box,
     write_bernstein_basis,
+    write_squared_norm_coefficients,
 )
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.gauge import write_watched_forces
@@ -178,7 +178,7 @@ def centred_control_point(points, k, i, mean):
 
 
 @jit
-def mean_control_points(points, monitor, mean):
+def write_mean_control_points(points, monitor, mean):
     """Mean (5, 3) of the control points of the agents that are monitored."""
     count = 0
     for i in range(monitor.left.shape[0]):
@@ -232,7 +232,7 @@ def bound_distance_changes(p, state, monitor):
     smallest u_i. As seen from above, tilting rotations change distances, too.
     """
     points, mean = state.trail.points[trail_row_of(0, state)], monitor.knots
-    mean_control_points(points, monitor, mean)
+    write_mean_control_points(points, monitor, mean)
     turn_x, turn_y, turn_z = rotation_over_step(points, mean, monitor)
     fastest = farthest = 0.0
     for i in range(monitor.left.shape[0]):
@@ -265,7 +265,7 @@ def bound_distance_changes(p, state, monitor):
 
 
 @jit
-def enclose_agents(points, monitor):
+def enclose_agents_in_balls(points, monitor):
     """Balls about the agents' middle control points that hold their positions over a step."""
     for i in range(monitor.balls.shape[0]):
         curve, ball = points[:, 3 * i : 3 * i + 3], monitor.balls[i]
@@ -346,7 +346,7 @@ def watch_speed(kind, curve, low, high, t, h, i, monitor):
     for k in range(5):
         for q in range(3):
             piece[3 * k + q] = curve[k, q] if low <= q < high else 0.0
-    squared_norm_coefficients(piece, -1.0, monitor.work[0])
+    write_squared_norm_coefficients(piece, -1.0, monitor.work[0])
     _, at = least_polynomial_value(monitor.work, 8, -greatest * abs(greatest))
     if at >= 0.0:
         store_if_worse(kind, -norm_at(piece, at), t + at * h, i, -1, monitor)
@@ -363,7 +363,7 @@ def clearance_to_beat(i, monitor):
 
 
 @jit
-def store_clearance(value, t, i, b, above, monitor):
+def store_obstacle_clearance(value, t, i, b, above, monitor):
     """Store the clearance of agent i to obstacle b; of one ``above`` it, which may be landing, until it leaves."""
     low = monitor.low
     store_if_worse(CLEARANCE, value, t, i, b, monitor)
@@ -407,7 +407,7 @@ def watch_obstacles(i, curve, t, h, last, monitor):
         if at >= 0.0:
             x_near, y_near, z_near = point_at(curve, at)
             _, _, up = box_normal(x_near, y_near, z_near, box)
-            store_clearance(value - radius, t + at * h, i, b, up >= STEEP, monitor)
+            store_obstacle_clearance(value - radius, t + at * h, i, b, up >= STEEP, monitor)
             floor = clearance_to_beat(i, monitor) + radius
     if not last or not (standing or monitor.low[i, 0] < math.inf):
         return
@@ -430,7 +430,7 @@ def watch_step_distances(step, p, state, monitor):
     """Take the extremes of distances and speeds over one step of the trail."""
     trail, row, n = state.trail, trail_row_of(step, state), monitor.left.shape[0]
     points, t, h = trail.points[row], trail.clock[row, 0], trail.clock[row, 1]
-    enclose_agents(points, monitor)
+    enclose_agents_in_balls(points, monitor)
     watch_pairs(SEPARATION, monitor.pairs, points, t, h, monitor)
     watch_pairs(LOST, monitor.struck, points, t, h, monitor)
     angle = frame_rotation_bound(points, p)
@@ -441,7 +441,7 @@ def watch_step_distances(step, p, state, monitor):
         world = monitor.world if p.body_formulation else points
         if p.body_formulation:
             write_world_control_points(points, part, parts, p, monitor)
-            enclose_agents(world, monitor)
+            enclose_agents_in_balls(world, monitor)
         for i in range(n):
             if not monitor.left[i]:
                 continue
@@ -575,7 +575,7 @@ def most_promising_peak(before, middle, after, ta, tb, tc, best, top, p, monitor
 
 
 @jit
-def search_forces_in(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
+def search_force_peaks(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
     """Search for the greatest forces between ta and tc, from gauges at ta < tb < tc.
 
     The law is evaluated where the parabola through three neighbouring values of an entry promises most. All entries
@@ -633,7 +633,7 @@ def watch_single_step_forces(step, before, after, p, w, state, monitor):
     start, end = state.trail.clock[trail_row_of(step, state), 0], step_end_time(step, state)
     middle, values = 0.5 * (start + end), monitor.gauge[1]
     evaluate_forces(middle, step, p, w, state, monitor, values)
-    search_forces_in(before, values, after, step, start, middle, end, p, w, state, monitor)
+    search_force_peaks(before, values, after, step, start, middle, end, p, w, state, monitor)
 
 
 @jit
@@ -660,7 +660,7 @@ def watch_forces(is_last, p, w, state, monitor):
             watch_single_step_forces(0, before, after, p, w, state, monitor)
         if step + 1 < steps:
             then, until = trail.gauge[trail_row_of(step + 1, state)], step_end_time(step + 1, state)
-            search_forces_in(earlier, after, then, step, start, end, until, p, w, state, monitor)
+            search_force_peaks(earlier, after, then, step, start, end, until, p, w, state, monitor)
         elif is_last and (step > 0 or not new):
             watch_single_step_forces(step, earlier, after, p, w, state, monitor)
     if is_last or steps == 0:

@@ -155,7 +155,7 @@ def relative_braking_limit(i, o, avoid):
 
 
 @jit
-def braking_relative_to_obstacle(i, o, v, avoid, out):
+def write_braking_relative_to_obstacle(i, o, v, avoid, out):
     """Acceleration (3,) that brakes vehicle i from a velocity v (3,) relative to obstacle o, straight, with drag.
 
     It bears the drag that the vehicle has at the obstacle's velocity, so that what is left acts on the relative one.

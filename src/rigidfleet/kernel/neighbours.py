@@ -94,7 +94,7 @@ def extrapolate_neighbour(j, axis, age, message, tracks, w, k1, k2):
 
 
 @jit
-def equation_of_edge(row, link, k, dt, tick, p, w, net, mail, saturated):
+def write_equation_of_edge(row, link, k, dt, tick, p, w, net, mail, saturated):
     """Row of vehicle i's own equations for the edge of a link, from its state in w.r and w.v, and its message.
 
     Fills the unit vector from the neighbour and the right side of Eq. (12) without any constraint force; integrates the
@@ -150,7 +150,7 @@ def solve_own_constraint_force(i, k, dt, tick, p, w, net, mail, saturated):
     mu, d = p.law.mu if iterated else 0.0, 0
     for l in range(net.first[i], net.first[i + 1]):
         if mail.grip[l] > 0.0:
-            equation_of_edge(d, l, k, dt, tick, p, w, net, mail, saturated)
+            write_equation_of_edge(d, l, k, dt, tick, p, w, net, mail, saturated)
             d += 1
     w.f_C[i] = 0.0
     for a in range(d):

@@ -19,7 +19,7 @@ from rigidfleet.kernel.monitor import (
     count_pieces,
     frame_rotation_bound,
     note_obstacle_departure,
-    store_clearance,
+    store_obstacle_clearance,
     write_world_control_points,
 )
 from rigidfleet.solids.distance import (
@@ -94,7 +94,7 @@ def cut_curve(curve, start, end, work, out):
 
 
 @jit
-def curve_in_solid_axes(curve, t, h, b, solids, out):
+def write_curve_in_solid_axes(curve, t, h, b, solids, out):
     """Control points (5, 3) in the axes of solid b, which moves straight from t to t + h."""
     x0, y0, z0 = solid_displacement(t, b, solids)
     x1, y1, z1 = solid_displacement(t + h, b, solids)
@@ -130,9 +130,9 @@ def watch_solid(i, b, curve, t, h, solids, monitor):
             end = min(stop, max((solids.times[way] - t) / h, start + _SHORTEST))
         if start > 0.0 or end < 1.0:
             cut_curve(curve, start, end, monitor.scratch[2], part)
-            curve_in_solid_axes(part, t + start * h, (end - start) * h, b, solids, own)
+            write_curve_in_solid_axes(part, t + start * h, (end - start) * h, b, solids, own)
         else:
-            curve_in_solid_axes(curve, t, h, b, solids, own)
+            write_curve_in_solid_axes(curve, t, h, b, solids, own)
         x, y, z = own[2, 0], own[2, 1], own[2, 2]
         floor, span = clearance_to_beat(i, monitor) + radius, ball_radius(own)
         if not (floor < math.inf and distance_bound(x, y, z, b, solids) - span >= floor):
@@ -144,7 +144,7 @@ def watch_solid(i, b, curve, t, h, solids, monitor):
                 share = start + at * (end - start)
                 x, y, z = point_at(curve, share)
                 above = is_solid_below(x, y, z, b, solids)
-                store_clearance(value - radius, t + share * h, i, b, above, monitor)
+                store_obstacle_clearance(value - radius, t + share * h, i, b, above, monitor)
         start = end
 
 

@@ -22,7 +22,7 @@ _curve = jit_inline(thrust_of)
 
 
 @jit
-def point_derivative(y, command, i, vehicles, air, push, dy):
+def write_point_derivative(y, command, i, vehicles, air, push, dy):
     """Derivative dy (17,) of vehicle i, an ideal point with the force ``command`` [N], limited by its own rules."""
     m = vehicles.m[i]
     for q in range(3):
@@ -33,7 +33,7 @@ def point_derivative(y, command, i, vehicles, air, push, dy):
 
 
 @jit
-def quadrotor_derivative(y, command, i, vehicles, around, air, push, T, dy):
+def write_quadrotor_derivative(y, command, i, vehicles, around, air, push, T, dy):
     """Derivative dy (17,) of the state y (17,) of vehicle i, see `fleet.STATES`.
 
     Parameters
@@ -50,7 +50,7 @@ def quadrotor_derivative(y, command, i, vehicles, around, air, push, T, dy):
         over = height_below(y[0], y[1], y[2], around.roofs) + around.radius[i]
         damping, lift = ground_damping_and_lift(m, vehicles.g, max(around.floor[i], over), y[2])
     if vehicles.point[i]:
-        point_derivative(y, command, i, vehicles, air, push, dy)
+        write_point_derivative(y, command, i, vehicles, air, push, dy)
     else:
         attitude_matrix(y[6:10], T)
         quaternion_rate(y[6:10], y[10:13], dy[6:10])
@@ -133,7 +133,7 @@ def runge_kutta(h, commands, vehicles, around, push, work):
         trial, rate = y[_TRIAL], y[_RATES + stage]
         for i in range(vehicles.m.shape[0]):
             first, air = 17 * i, work.air[(stage + 1) // 2, i]
-            quadrotor_derivative(
+            write_quadrotor_derivative(
                 trial[first : first + 17], commands[i], i, vehicles, around, air, push[i], work.T,
                 rate[first : first + 17],
             )  # fmt: skip

@@ -8,13 +8,13 @@ are evaluated at each stage, a user's force in the middle of each step, downwash
 
 import math
 
-from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity_in_step
+from rigidfleet.kernel.aerodynamics import add_downwash_to_air, write_air_velocity_in_step
 from rigidfleet.kernel.attitude_control import command_rotors
 from rigidfleet.kernel.clock_records import OFF, RATE, SLOPE
 from rigidfleet.kernel.clocks import (
     advance_clocks,
     apply_own_clock,
-    drop_constraint_force,
+    drop_own_constraint_force,
     post_clock,
     write_slots_by_own_clock,
 )
@@ -229,7 +229,7 @@ def evaluate_distributed_law(k, t, dt, p, w, flight, state):
         else:
             solve_own_constraint_force(i, k, dt, tick, p, w, net, mail, state.saturated[i])
         if stuck:
-            drop_constraint_force(i, w, net, state)
+            drop_own_constraint_force(i, w, net, state)
         write_desired_force(k, i, dt, p, w, flight, state)
         for q in range(3):
             mail.commanded[i, q] = state.force[i, q] * p.vehicles.inverse[i]
@@ -395,7 +395,7 @@ def advance_states(start, h, flight, state):
 
 
 @jit
-def find_air_velocity(t, h, S, p, flight, state):
+def find_air_and_push(t, h, S, p, flight, state):
     """Velocity of the air [m/s] over a step from states S (N, 17), into ``work.air``; a user's force in its middle.
 
     The force is asked before: position and velocity in the middle of the step stand in rows of the air's until then.
@@ -408,16 +408,16 @@ def find_air_velocity(t, h, S, p, flight, state):
             for q in range(3):
                 work.air[0, i, q], work.air[1, i, q] = S[i, q] + 0.5 * h * S[i, 3 + q], S[i, 3 + q]
         call_external(p.external.address, t + 0.5 * h, work.air[0], work.air[1], state.push)
-    air_velocity_in_step(t, h, flight.air, work.air)
+    write_air_velocity_in_step(t, h, flight.air, work.air)
     if flight.air.downwash:
-        add_downwash(state.S, flight.vehicles, flight.air.density, work.T, work.air)
+        add_downwash_to_air(state.S, flight.vehicles, flight.air.density, work.T, work.air)
     return abs(state.push.sum()) < math.inf
 
 
 @jit
 def write_derivatives(sample, t, p, flight, state, call):
     """Derivatives of the states of a sample: those at the start of a step without length."""
-    find_air_velocity(t, 0.0, call.S[sample], p, flight, state)
+    find_air_and_push(t, 0.0, call.S[sample], p, flight, state)
     advance_states(call.S[sample], 0.0, flight, state)
     for i in range(state.S.shape[0]):
         for q in range(17):
@@ -434,7 +434,7 @@ def write_samples(t, h, p, flight, state, call):
         if x > h * (1.0 + _SAME):
             return
         x = h if x > h * (1.0 - _SAME) else x
-        find_air_velocity(t, x, state.S, p, flight, state)
+        find_air_and_push(t, x, state.S, p, flight, state)
         advance_states(state.S, x, flight, state)
         for i in range(state.S.shape[0]):
             for q in range(17):
@@ -517,7 +517,7 @@ def advance_fleet(t, h, p, flight, state):
 
     Returns False, and advances none, if a user's force is not finite.
     """
-    if not find_air_velocity(t, h, state.S, p, flight, state):
+    if not find_air_and_push(t, h, state.S, p, flight, state):
         return False
     row, trail = state.count[TRAILED], state.trail
     kept = trail.clock.shape[0] > 0

@@ -61,7 +61,7 @@ def quaternion_from_dcm(T: ArrayLike) -> Floats:
     Computed from the largest component, so that no small number is a divisor. Raises ValueError if T is
     not a rotation to 1e-6.
     """
-    T = _check_vectors("T", T, 3, 3)
+    T = _check_last_axes("T", T, 3, 3)
     if T.ndim == 2:
         return np.array(_quaternion_of_entries(*T.ravel().tolist()))
     N = (T.reshape(-1, 9) @ _PRODUCTS).reshape(-1, 4, 4) + _ONE  # 4 q q^T
@@ -103,7 +103,7 @@ def _quaternion_of_entries(
 
 def dcm_from_euler(euler: ArrayLike) -> Floats:
     """Direction cosines (..., 3, 3) of Euler angles (..., 3) = (roll, pitch, yaw) [rad]."""
-    angles = np.moveaxis(_check_vectors("euler", euler, 3), -1, 0)
+    angles = np.moveaxis(_check_last_axes("euler", euler, 3), -1, 0)
     sr, sp, sy = np.sin(angles)
     cr, cp, cy = np.cos(angles)
     rows = [
@@ -120,7 +120,7 @@ def euler_from_dcm(T: ArrayLike) -> Floats:
     Roll and yaw lie in [-pi, pi], pitch in [-pi/2, pi/2]. At pitch = +-90 deg only the sum or
     difference of roll and yaw is defined; roll is then 0. The angles always reproduce T to rounding.
     """
-    T = _check_vectors("T", T, 3, 3)
+    T = _check_last_axes("T", T, 3, 3)
     cos_pitch = np.hypot(T[..., 0, 0], T[..., 0, 1])
     pitch = np.arctan2(-T[..., 0, 2], cos_pitch)
     locked = cos_pitch < 1e-12
@@ -149,15 +149,15 @@ def quaternion_rate(q: ArrayLike, omega: ArrayLike) -> Floats:
     qdot = 1/2 Omega(omega) q, Eq. (21); the same as 1/2 q (0, omega), and as
     Tdot = -[omega x] T.
     """
-    omega = _check_vectors("omega", omega, 3)
+    omega = _check_last_axes("omega", omega, 3)
     zero = np.zeros((*omega.shape[:-1], 1))
     return 0.5 * quaternion_multiply(q, np.concatenate([zero, omega], axis=-1))
 
 
 def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Floats:
     """Hamilton's product p q (..., 4): T(p q) = T(q) T(p), first p, then q from there."""
-    p0, p1, p2, p3 = np.moveaxis(_check_vectors("p", p, 4), -1, 0)
-    q0, q1, q2, q3 = np.moveaxis(_check_vectors("q", q, 4), -1, 0)
+    p0, p1, p2, p3 = np.moveaxis(_check_last_axes("p", p, 4), -1, 0)
+    q0, q1, q2, q3 = np.moveaxis(_check_last_axes("q", q, 4), -1, 0)
     product = [
         p0 * q0 - p1 * q1 - p2 * q2 - p3 * q3,
         p0 * q1 + p1 * q0 + p2 * q3 - p3 * q2,
@@ -169,7 +169,7 @@ def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Floats:
 
 def quaternion_conjugate(q: ArrayLike) -> Floats:
     """Conjugate (q0, -q1, -q2, -q3) (..., 4): its T is the transpose, body to world."""
-    return _check_vectors("q", q, 4) * np.array([1.0, -1.0, -1.0, -1.0])
+    return _check_last_axes("q", q, 4) * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def unwrap_quaternion(q: ArrayLike) -> Floats:
@@ -177,7 +177,7 @@ def unwrap_quaternion(q: ArrayLike) -> Floats:
 
     The first sample keeps its sign; after a gap of NaN, the last sample before it decides.
     """
-    q = _check_vectors("q", q, 4)
+    q = _check_last_axes("q", q, 4)
     if q.ndim < 2:
         raise ValueError(f"q must be a time series (..., K, 4), not of shape {q.shape}")
     known = ~np.isnan(q).any(axis=-1)
@@ -200,7 +200,7 @@ def angle_between(p: ArrayLike, q: ArrayLike) -> Floats:
 
 def quaternion_from_rotation_vector(phi: ArrayLike) -> Floats:
     """Unit quaternions (..., 4) of rotation vectors phi (..., 3) [rad]; q0 < 0 beyond half a turn."""
-    phi = _check_vectors("phi", phi, 3)
+    phi = _check_last_axes("phi", phi, 3)
     x = np.linalg.norm(phi, axis=-1, keepdims=True)
     small = x < 1e-4
     ratio = np.where(small, 0.5 - x**2 / 48, np.sin(0.5 * x) / np.where(small, 1.0, x))
@@ -226,7 +226,7 @@ def dcm_from_rotation_vector(phi: ArrayLike) -> Floats:
 
 def rotation_vector_from_dcm(T: ArrayLike) -> Floats:
     """Rotation vectors (..., 3) [rad], at most pi long, of direction cosines (..., 3, 3)."""
-    T = _check_vectors("T", T, 3, 3)
+    T = _check_last_axes("T", T, 3, 3)
     if T.ndim == 2:
         return np.array(single_rotation_vector(T))
     return rotation_vector_from_quaternion(quaternion_from_dcm(T))
@@ -246,7 +246,7 @@ def rotation_vector_rate(phi: ArrayLike, omega: ArrayLike) -> Floats:
     phi_dot = omega + phi x omega / 2 + k phi x (phi x omega), k = (1 - x/2 cot(x/2))/x^2,
     x = |phi|. It is singular at full turns, x = 2 pi; keep |phi| <= pi.
     """
-    phi, omega = _check_vectors("phi", phi, 3), _check_vectors("omega", omega, 3)
+    phi, omega = _check_last_axes("phi", phi, 3), _check_last_axes("omega", omega, 3)
     with np.errstate(invalid="ignore"):
         rates = _rates(*np.moveaxis(phi, -1, 0), *np.moveaxis(omega, -1, 0))
     return np.stack(rates, axis=-1).astype(np.float64)
@@ -278,7 +278,7 @@ def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Floats:
     z = x cross y. Positions r (..., 3, 3) [m], one row per agent; masses (3,) [kg], equal by
     default. Raises ValueError for agents on a line, for which the recipe has no y axis.
     """
-    r = _check_vectors("r", r, 3, 3)
+    r = _check_last_axes("r", r, 3, 3)
     m = np.ones(3) if masses is None else np.asarray(masses, dtype=float)
     if m.shape != (3,) or not np.all(m > 0):
         raise ValueError(f"masses must be three positive numbers [kg], not {masses!r}")
@@ -298,7 +298,7 @@ def triangle_frame(r: ArrayLike, masses: ArrayLike | None = None) -> Floats:
     return np.stack([x, np.cross(z, x), z], axis=-2)
 
 
-def _check_vectors(name: str, value: ArrayLike, *shape: int) -> Floats:
+def _check_last_axes(name: str, value: ArrayLike, *shape: int) -> Floats:
     """Array of floats whose last axes have this shape."""
     array = np.asarray(value, dtype=float)
     if array.shape[-len(shape) :] != shape:
@@ -314,7 +314,7 @@ def _matrices_of_entries(rows: list[list[Floats]]) -> Floats:
 
 
 def _unit_quaternions(q: ArrayLike) -> Floats:
-    q = _check_vectors("q", q, 4)
+    q = _check_last_axes("q", q, 4)
     norm = np.sqrt((q * q).sum(axis=-1, keepdims=True))
     if (norm == 0.0).any():
         raise ValueError(

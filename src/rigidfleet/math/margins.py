@@ -223,7 +223,7 @@ class Margins:
         return {"stable": self.stable, "gain": self.gain, "phase_deg": phase, "delay_s": self.delay}
 
 
-def formation_loops(
+def distinct_formation_loops(
     positions: ArrayLike,
     edges: ArrayLike,
     masses: ArrayLike,
@@ -242,7 +242,7 @@ def formation_loops(
     lags : of each agent
     """
     r, m = np.asarray(positions, dtype=np.float64), np.asarray(masses, dtype=np.float64)
-    S = constraint_share_matrix(r, np.asarray(edges, dtype=np.int64).reshape(-1, 2), m, law)
+    S = constraint_filter_matrix(r, np.asarray(edges, dtype=np.int64).reshape(-1, 2), m, law)
     rigid = rigid_motions(r, m)
     Q = rigid @ rigid.T
     kinds = [(lag, axis == 2 and not lag.point) for lag in lags for axis in range(3)]
@@ -271,7 +271,7 @@ def tracking_loops(lags: Sequence[Lag]) -> list[Loop]:
     return [Loop(zero, zero, one, (kind,)) for kind in kinds]
 
 
-def constraint_share_matrix(r: Floats, edges: Ints, m: Floats, law: LoopGains) -> Floats:
+def constraint_filter_matrix(r: Floats, edges: Ints, m: Floats, law: LoopGains) -> Floats:
     """S (3N, 3N): the law's share of the input, with nearly equal filter factors made equal."""
     if not len(edges):
         return np.zeros((r.size, r.size))

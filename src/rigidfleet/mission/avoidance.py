@@ -97,7 +97,7 @@ def lag_coefficients(
     return lags
 
 
-def extra_radii(
+def avoidance_margins(
     table: Avoidance, models: Sequence[VehicleModel], disturbances: Disturbances | None
 ) -> Floats:
     """By how much each vehicle is taken to be larger (N,) [m]: by noise, and by what lags leave out."""

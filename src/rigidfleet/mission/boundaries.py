@@ -54,7 +54,7 @@ class _Boundary(NamedTuple):
     close: float
 
 
-def areas_of(mission: Mission, quantity: str) -> list[tuple[int, Region]]:
+def areas_judged_by(mission: Mission, quantity: str) -> list[tuple[int, Region]]:
     """Numbers and regions of the fences, or of the places with people, that a quantity is about."""
     things = mission.people if quantity == "people" else mission.fences
     regions = [(k, x.region(mission.geodetic_origin, mission.ground)) for k, x in enumerate(things)]
@@ -86,11 +86,11 @@ class Boundaries:
         kind_of = [fence.kind for fence in mission.fences]
         self.every = [
             _Boundary("people", k, partial(self._nearness_of_falls, region), CLOSE_FALL)
-            for k, region in areas_of(mission, "people")
+            for k, region in areas_judged_by(mission, "people")
         ] + [
             _Boundary(name, k, partial(_distance_outside, region, kind_of[k] == "inclusion"), CLOSE)
             for name in ("fence", "soft_fence")
-            for k, region in areas_of(mission, name)
+            for k, region in areas_judged_by(mission, name)
         ]
 
     def values(self, quantity: str, r: Floats, v: Floats) -> tuple[Floats, Ints]:

@@ -70,7 +70,7 @@ def check_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     _validate_tables(m)
     for path, rules in (
         (("agents",), _agent_rules),
-        (("constraint",), _gain_rules),
+        (("constraint",), _constraint_gain_rules),
         (("lqr",), _regulator_rules),
         (("tracking",), _tracking_rules),
         (("allocation",), _torque_allocation_rules),
@@ -247,7 +247,7 @@ def _too_many_touching_rules(m: Draft) -> Breaches:
             return
 
 
-def _gain_rules(m: Draft) -> Breaches:
+def _constraint_gain_rules(m: Draft) -> Breaches:
     """The feedback of constraints is stable."""
     c = m.constraint
     if c.stabilisation == "none":
@@ -357,7 +357,7 @@ def _each_obstacle_rules(m: Draft) -> Breaches:
     things = []
     for k, data in enumerate(m.tables("obstacles")):
         path = ("obstacles", k)
-        if (kind := m.model_of_kind(data, path, obstacles.KINDS)) is None:
+        if (kind := m.model_class_of_kind(data, path, obstacles.KINDS)) is None:
             continue
         name = "ground" if kind is obstacles.Ground else f"{data['kind']} {k + 1}"
         if (thing := m.validate(kind, data, path, {"name": name})) is not None:

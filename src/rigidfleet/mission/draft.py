@@ -83,7 +83,7 @@ def draft(
     slots = shapes.slots(shape, list(size), n)
     nearest = float(proximity.nearest(slots).min()) if n > 1 else SIZE
     radius = min(RADIUS, nearest / 4)
-    start, below = _starts_below_slots(slots, min(_APART, nearest))
+    start, below = _starts_and_whether_below(slots, min(_APART, nearest))
     low = float(-slots[:, 2].min()) + radius
     height = max(5.0, math.ceil(np.ptp(slots[:, 2]) + 3.0))
     if waypoints is None:
@@ -136,7 +136,7 @@ def agents_for(shape: str) -> int:
     return usual.get(shape, taken.start)
 
 
-def _starts_below_slots(slots: Floats, apart: float) -> tuple[Floats, bool]:
+def _starts_and_whether_below(slots: Floats, apart: float) -> tuple[Floats, bool]:
     """Return start positions (N, 3) [m] on the ground, and whether each is below its slot.
 
     Where slots lie above each other, agents start on a grid, or few on a line.

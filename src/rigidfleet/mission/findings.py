@@ -88,7 +88,7 @@ class FindingCollector:
         self.add((key,), "must be an array of tables", f"write [[{key}]] above each table")
         return []
 
-    def model_of_kind(self, data: Any, path: Keys, kinds: Mapping[str, type[Any]]) -> Any:
+    def model_class_of_kind(self, data: Any, path: Keys, kinds: Mapping[str, type[Any]]) -> Any:
         """Return the model for the ``kind`` of a table, or None with a finding."""
         choice = f"use one of {', '.join(kinds)}"
         if not isinstance(data, dict):

@@ -100,7 +100,7 @@ def _validate_phases(m: Draft) -> Generator[Breach, None, list[Any]]:
     body = m.data.get("architecture") == "body"
     phases: list[Any] = []
     for k, data in enumerate(m.tables("phases")):
-        if (model := m.model_of_kind(data, ("phases", k), KINDS)) is None:
+        if (model := m.model_class_of_kind(data, ("phases", k), KINDS)) is None:
             phases.append(None)
             continue
         control = model.body_control if body else "tracking"

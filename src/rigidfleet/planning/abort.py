@@ -40,7 +40,7 @@ from rigidfleet.planning.certificate import (
     prove_straight_ways,
     prove_ways,
 )
-from rigidfleet.planning.clearance import greatest_shift
+from rigidfleet.planning.clearance import shift_bound
 from rigidfleet.planning.courses import ABOVE
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg
@@ -335,7 +335,7 @@ class Aborts:
         end = way.at(way.time[-1:])[0]
         return Step(name, make, float(way.time[-1]), end, least, self._gap_loss(way) + off, **how)
 
-    def slow_down(self, begins: float) -> tuple[Step, str]:
+    def slow_down_step(self, begins: float) -> tuple[Step, str]:
         """Slow down along the plan from a time on [s], in the least time that keeps the limits, or fly to its landing.
 
         Where the plan itself is beyond a limit, that counts as the limit.
@@ -436,7 +436,7 @@ class Aborts:
         v = way.states(np.linspace(0.0, step.duration, _LOOKS), 2)[1]
         far, when = step.duration * float(np.linalg.norm(v, axis=2).max()), np.array([begin])
         moved = (
-            greatest_shift(x.solid, when, when + step.duration)[0] for x in things if x.solid.moves
+            shift_bound(x.solid, when, when + step.duration)[0] for x in things if x.solid.moves
         )
         far += max(moved, default=0.0)
         time = np.linspace(0.0, step.duration, 2 + math.ceil(far / _PACE / 2.0))
@@ -609,7 +609,7 @@ class Aborts:
         if phase.control != "tracking":
             reason = f"only tracked slots can slow down, and '{phase.name}' tracks none"
             return Abort(ordered, begins, (), Home(reason=reason))
-        step, problem = self.slow_down(begins)
+        step, problem = self.slow_down_step(begins)
         if self.mission_lands and step.path is not None and step.path > self.plan_end - 1e-6:
             return Abort(ordered, begins, (step,), Home((), "lands as planned"))
         if problem := problem or self.obstruction_in_words(step, begins):
@@ -640,7 +640,7 @@ class Aborts:
             if alone.home.reason:
                 problem = alone.home.reason
                 continue
-            make = partial(self._all_ways, begins, waits, alone.steps)
+            make = partial(self._ways_of_all, begins, waits, alone.steps)
             way = make()
             proved = self._prove_ways_of(way, order, len(who))
             step = self._step("leave", make, min(proved, plan), 0.0)
@@ -654,7 +654,7 @@ class Aborts:
             return Abort(ordered, begins, (step,), home, waits, slow.duration)
         return Abort(ordered, begins, (), Home(reason=problem))
 
-    def _all_ways(self, begins: float, waits: float, steps: Sequence[Step]) -> Piecewise:
+    def _ways_of_all(self, begins: float, waits: float, steps: Sequence[Step]) -> Piecewise:
         """The ways from a time on [s] of those that wait so long and then fly steps, and of the others, by the plan."""
         last = np.array([max(begins, self.plan_end - _TOUCHING), self.plan_end])
         states = self.plan.states(last, 4)

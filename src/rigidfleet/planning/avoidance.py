@@ -7,7 +7,7 @@ import numpy as np
 from rigidfleet.kernel import avoidance, fleet
 from rigidfleet.mission import Mission
 from rigidfleet.mission.avoidance import (
-    extra_radii,
+    avoidance_margins,
     lag_coefficients,
     reaction_times,
     spare_accelerations,
@@ -50,7 +50,7 @@ def avoidance_in_flight(
         tilt=np.array(
             [np.inf if model.point else np.radians(model.tilt_limit_deg) for model in models]
         ),
-        spare=extra_radii(settings, models, mission.disturbances),
+        spare=avoidance_margins(settings, models, mission.disturbances),
         rate=settings.rate,
         share=settings.share,
         release=settings.release,
@@ -66,7 +66,7 @@ def kept_distances(mission: Mission) -> tuple[float, float]:
     limit = mission.limits.separation or 0.0
     if settings is None or models is None:
         return limit, 0.0
-    spare = float(extra_radii(settings, models, mission.disturbances).max())
+    spare = float(avoidance_margins(settings, models, mission.disturbances).max())
     separation = limit if settings.separation is None else settings.separation
     return max(limit, separation + 2.0 * spare), settings.clearance + spare
 

@@ -29,7 +29,7 @@ _HALVINGS, _AT_ONCE, _IN_ALL = 16, 200_000, 4_000_000
 _BLEND_RATE = 140.0
 
 
-def greatest_speeds(reference: Reference, motion: Motion, begin: Floats, end: Floats) -> Floats:
+def slot_speed_bounds(reference: Reference, motion: Motion, begin: Floats, end: Floats) -> Floats:
     """Upper bounds (L, N) [m/s] of the speed of each slot over spans of time, from ``begin`` to ``end`` (L,) [s].
 
     About the middle of a span of length 2 h, a polynomial with Taylor coefficients c_k has a rate of at most the sum of
@@ -74,7 +74,7 @@ def _bounds(knots: Floats, ways: Floats, begin: Floats, end: Floats) -> tuple[Fl
 def speed_bounds(planned: PlannedPhase) -> Floats:
     """Bounds (K - 1, N) [m/s] of the speeds between the samples of a planned phase."""
     time = planned.time
-    return greatest_speeds(*planned.leg.slots_and_motion, time[:-1], time[1:])
+    return slot_speed_bounds(*planned.leg.slots_and_motion, time[:-1], time[1:])
 
 
 class Closest(NamedTuple):
@@ -126,7 +126,7 @@ def clearance_to(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: 
         spans = todo.popleft()
         way = spans.speed * spans.length[:, None]
         if solid.moves:
-            way = way + greatest_shift(solid, spans.first, spans.first + spans.length)[:, None]
+            way = way + shift_bound(solid, spans.first, spans.first + spans.length)[:, None]
         low = 0.5 * (spans.near + spans.far - way)
         open_ = low < best - CLOSE
         if not open_.any():
@@ -174,7 +174,7 @@ def _path_and_speeds(
     return at, np.concatenate([first, planned.position[within], last]), speed[span]
 
 
-def greatest_shift(solid: Solids, begins: Floats, ends: Floats) -> Floats:
+def shift_bound(solid: Solids, begins: Floats, ends: Floats) -> Floats:
     """Greatest way (L,) [m] of a solid between times (L,) [s]: its greatest speed counts wherever it moves."""
     speed = np.linalg.norm(np.diff(solid.ways, axis=0), axis=1) / np.diff(solid.times)
     within = (solid.times[:-1] < ends[:, None]) & (solid.times[1:] > begins[:, None])

@@ -77,10 +77,10 @@ class Course(NamedTuple):
 
 def course(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:
     """Course of the virtual body in a phase that ends at ``t_end`` [s], from a state with the frame attached."""
-    return _COURSES.get(phase.kind, _rest_course)(mission, phase, now, t_end)
+    return _COURSES.get(phase.kind, _course_to_rest)(mission, phase, now, t_end)
 
 
-def _rest_course(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:
+def _course_to_rest(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:
     """Come to rest at the previous goal, or the phase's own place; by the end, if known, as no time is given."""
     arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
     if now.goal is None:
@@ -92,7 +92,7 @@ def _rest_course(mission: Mission, phase: Phase, now: PhaseState, t_end: float) 
 
 def _reshape_course(mission: Mission, phase: Reshape, now: PhaseState, t_end: float) -> Course:
     """Stay, or go to the phase's own place; slots may go on bent ways."""
-    rest = _rest_course(mission, phase, now, t_end)
+    rest = _course_to_rest(mission, phase, now, t_end)
     if not phase.has_bent_ways:
         return rest
     control, blend = np.array(phase.control_points), seconds(phase.blend)
@@ -215,7 +215,7 @@ def _follow_course(mission: Mission, phase: Follow, now: PhaseState, t_end: floa
     return Course(goal, arrival, lambda: motion, lift)
 
 
-def slot_motion_conflict_text(phase: Any, now: PhaseState) -> str:
+def moving_slots_conflict_text(phase: Any, now: PhaseState) -> str:
     """What keeps a phase from going on with the motion of slots, where files have ended in it; "" if nothing."""
     goes_on = phase.control == "open" or (phase.follows_curves and phase.pieces[1].shape[1] > 1)
     if now.rates is None or goes_on:

@@ -60,7 +60,7 @@ def candidate_shapes(mission: Mission, phase: Go, own: str) -> Iterator[Candidat
             yield CandidateShape(name, slots, stage)
 
 
-def lattice_axes(obstacles: Sequence[Obstacle]) -> list[Floats]:
+def lattice_frames(obstacles: Sequence[Obstacle]) -> list[Floats]:
     """Axes (3, 3) of the lattices: the world's, and those of boxes that are turned about the vertical."""
     rotations = [np.eye(3)]
     for thing in obstacles:
@@ -111,7 +111,7 @@ def changes_between_layers(
                 yield Change(s * count + i, s * count + j, *_turn_path_and_ways(shape.slots, a, b))
     for (s, one), (t, two) in combinations(enumerate(shapes), 2):
         for i, a in enumerate(angles):
-            if (folding := _shape_change_path(mission, one, two, a)) is not None:
+            if (folding := _shape_change_path_and_ways(mission, one, two, a)) is not None:
                 yield Change(s * count + i, t * count + i, *folding)
 
 
@@ -125,7 +125,7 @@ def _turn_path_and_ways(slots: Floats, before: Angles, after: Angles) -> tuple[P
     )
 
 
-def _shape_change_path(
+def _shape_change_path_and_ways(
     mission: Mission, one: CandidateShape, two: CandidateShape, angles: Angles
 ) -> tuple[Path, Floats] | None:
     """Offsets and ways of a change of shape, as references blend it; None if agents come too near each other."""

@@ -17,7 +17,7 @@ from rigidfleet.mission.findings import Keys
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import ways
 from rigidfleet.planning.body_trajectories import points_passed
-from rigidfleet.planning.courses import slot_motion_conflict_text, way_conflict_text
+from rigidfleet.planning.courses import moving_slots_conflict_text, way_conflict_text
 from rigidfleet.planning.legs import Departure, Leg, depart, leg_from, state_at_start
 from rigidfleet.planning.limits import Limit, Reached, limits_of, use_of_limits
 from rigidfleet.planning.reference import PhaseState
@@ -88,7 +88,7 @@ def complete_times(mission: Mission) -> Mission:
     tables = mission.to_dict()["phases"]
     now = state_at_start(mission)
     for k, phase in enumerate(mission.phases[: last + 2]):
-        if problem := slot_motion_conflict_text(phase, now):
+        if problem := moving_slots_conflict_text(phase, now):
             remedy = "let the trajectories before end at rest, or let those of each vehicle go on"
             raise ways.error_of_key(mission, k, "kind", None, problem, remedy)
         if k > last:

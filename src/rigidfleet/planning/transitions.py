@@ -92,7 +92,7 @@ def _expand_transition(
         return [
             _add_bent_ways(mission, number, table, phase, before, _allowed_box(mission, state()))
         ], {}
-    stops = _layer_slots(mission, number, phase, before)
+    stops = _layer_stops(mission, number, phase, before)
     if stops is None:
         return [table], {}
     names = [f"{phase.name}: {part}" for part in _PARTS[:2]]
@@ -284,7 +284,7 @@ def _slots_at_ends(
     return p, q
 
 
-def _layer_slots(
+def _layer_stops(
     mission: Mission, number: int, phase: Reshape, before: str | None
 ) -> list[Floats] | None:
     """Slots (N, 3) [m] before and after the three parts of a phase by layers; None if its straight ways will do."""

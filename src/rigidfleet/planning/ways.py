@@ -101,7 +101,7 @@ class _Search:
 
     # -- what there is to choose from ------------------------------------------------------------------
 
-    def _near_obstacles(self) -> list[Any]:
+    def _near_obstacles_at_rest(self) -> list[Any]:
         """Obstacles at rest that may stand in the way."""
         low, high = self._search_box
         low, high = low - self.reach - 1.0, high + self.reach + 1.0
@@ -161,11 +161,11 @@ class _Search:
         return best[0], best[0].shorten_way(best[1])
 
     def _roadmap(self, shapes: list[layers.CandidateShape], need: float, *, more: bool) -> Roadmap:
-        frames = layers.lattice_axes(self._near_obstacles())
+        frames = layers.lattice_frames(self._near_obstacles_at_rest())
         fence = self.mission.limits.geofence
         box = np.array([[-np.inf] * 3, [np.inf] * 3])
         box = box if fence is None else np.array([fence.min, fence.max]) + [[need], [-need]]
-        space = FreeSpace(self._near_obstacles(), box)
+        space = FreeSpace(self._near_obstacles_at_rest(), box)
         roll, pitch, yaw_before = self.start
         yaws = {yaw_before + yaw for yaw in _YAWS} if more else set()
         for shape in shapes:
@@ -322,7 +322,7 @@ class _Search:
             f"no way is found: at the narrowest place of the best one, ({where}) m, '{x.formation}' at yaw"
             f" {x.angles[2]:.4g}° "
         ) + (
-            self._gap_in_words(roadmap, place, layer)
+            self._needed_gap_in_words(roadmap, place, layer)
             or f"has {least:.2f} m of clearance from {thing}, {roadmap.need - least:.2f} m less than asked for"
         )
         remedy = "allow a slimmer formation (formations, scales), ask for less clearance, or name points on the way"
@@ -337,7 +337,7 @@ class _Search:
         thing = f"'{space.obstacles[near[agent]].name}'" if near[agent] >= 0 else "the geofence"
         return float(room[agent]), agent, thing
 
-    def _gap_in_words(self, roadmap: Roadmap, place: Floats, layer: int) -> str:
+    def _needed_gap_in_words(self, roadmap: Roadmap, place: Floats, layer: int) -> str:
         """What a shape needs in the gap between the two nearest obstacles; "" if they do not lie on two sides of it."""
         x, boxes = roadmap.layers[layer], []
         for other in roadmap.space.obstacles:

@@ -11,7 +11,7 @@ from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, display
 from rigidfleet.math import attitude as att
 from rigidfleet.plotting import quadrotors
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.peaks import IDLE, Panel, distinct_limits, peak_before_breakdown
+from rigidfleet.plotting.peaks import IDLE, Panel, distinct_thrust_limits, peak_before_breakdown
 from rigidfleet.result import Extremum, Result
 from rigidfleet.result.quantities import owner_name, samples
 from rigidfleet.typing import Floats
@@ -264,28 +264,28 @@ def has_thrust(result: Result) -> bool:
     return bool(np.isfinite(result.thrust).any())
 
 
-def draw_thrust(ax: Axes, result: Result) -> None:
+def draw_thrust_or_distance(ax: Axes, result: Result) -> None:
     """Thrust of each agent with its limit, from zero; of a log, which has none, the distance from its slot."""
     if not has_thrust(result):
         quadrotors.draw_slot_distance(ax, result)
         return
     ax.set_ylabel("thrust [N]")
     panel = Panel(ax, result, result.thrust, "N", result.extreme("thrust"))
-    panel.draw(distinct_limits(result.mission.fleet.thrust_limit), always=False)
+    panel.draw(distinct_thrust_limits(result.mission.fleet.thrust_limit), always=False)
 
 
 @st.styled_figure(has_thrust, "forces are not known")
 def inputs(result: Result) -> Figure:
     """Thrust of each vehicle with its limit, and enlarged."""
     fig, (above, below) = st.time_figure(result, "Thrust of each agent", 2)
-    draw_thrust(above, result)
+    draw_thrust_or_distance(above, result)
     st.draw_agent_lines(below, result, result.thrust)
     below.set_ylabel("enlarged [N]")
     if not st.note_if_constant(below, result.thrust, "N"):
         panel = Panel(below, result, result.thrust, "N", result.extreme("thrust"))
         panel.crop_final_peak()
         _widen_limits(below, min(0.1, 0.1 * peak_before_breakdown(result, result.thrust)))
-        panel.mark_peak()
+        panel.write_peak()
     st.draw_agents_legend(above, result.n_agents)
     return fig
 
@@ -307,7 +307,7 @@ def constraint_force(result: Result) -> Figure:
         draw_edge_lines(below, result, tension)
         below.axhline(0.0, color=st.FAINT, linewidth=0.6, zorder=1)
         edges.crop_final_peak()
-        edges.mark_peak(always=False)
+        edges.write_peak(always=False)
         st.draw_legend(below, edge_handles(result))
     return fig
 

@@ -31,7 +31,7 @@ def peak_before_breakdown(result: Result, values: Floats) -> float:
     return peak if result.complete or peak < 10 * usual else 2 * usual
 
 
-def distinct_limits(values: Floats) -> list[Limit]:
+def distinct_thrust_limits(values: Floats) -> list[Limit]:
     """Each distinct limit of the agents' limits (N,) with a label and a colour; the agent's if only one has it."""
     colours = st.agent_colours(len(values))
     lines = []
@@ -65,7 +65,7 @@ class Panel:
     between: Extremum | None = None
     name: Callable[[int], str] = _agent_name
 
-    def mark_peak(self, *, always: bool = True) -> None:
+    def write_peak(self, *, always: bool = True) -> None:
         """Write the greatest value into the axes, and mark values off the scale at top and bottom.
 
         Without ``always``, only values off the scale are written.
@@ -117,7 +117,7 @@ class Panel:
     def draw(self, limits: Sequence[Limit] = (), *, always: bool = True) -> bool:
         """Draw each agent's values from zero, with their limits; return whether there was anything to draw.
 
-        The greatest is written; see `mark_peak`.
+        The greatest is written; see `write_peak`.
         """
         if self.note_if_rounding():
             return False
@@ -128,5 +128,5 @@ class Panel:
         top = max([peak, *(value for value, *_ in limits)])
         if top > 0.0:
             self.ax.set_ylim(-0.04 * top, 1.12 * top)
-        self.mark_peak(always=always)
+        self.write_peak(always=always)
         return True

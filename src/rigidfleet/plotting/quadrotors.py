@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _TEXT_ROW = 0.35  # height of a row that holds only text
 
 
-def rotor_limits(mission: Mission) -> Floats:
+def rotor_limit(mission: Mission) -> Floats:
     """Maximum thrust (N,) of a rotor of each vehicle [N]; NaN for points, which have none."""
     limits = np.zeros(mission.n_agents)
     limits[:] = QUANTITIES["rotor_force"].limit_of(mission) or 0.0
@@ -32,19 +32,19 @@ def rotor_limits(mission: Mission) -> Floats:
 
 def has_rotors(result: Result) -> bool:
     """Whether a vehicle with rotors flies, and what they give is known."""
-    return result.rotor_force is not None and bool(np.isfinite(rotor_limits(result.mission)).any())
+    return result.rotor_force is not None and bool(np.isfinite(rotor_limit(result.mission)).any())
 
 
 def rotor_forces(result: Result) -> Floats:
     """Thrust (K, N, 4) of each rotor [N]; NaN for points and for vehicles that are lost."""
     assert result.rotor_force is not None
-    known = result.left & np.isfinite(rotor_limits(result.mission))
+    known = result.left & np.isfinite(rotor_limit(result.mission))
     return np.where(known[..., None], result.rotor_force, np.nan)
 
 
 def tilt(result: Result) -> Floats:
     """Tilt (K, N) of each vehicle [deg]; NaN for points and for vehicles that are lost."""
-    known = np.isfinite(rotor_limits(result.mission))
+    known = np.isfinite(rotor_limit(result.mission))
     return np.where(known, samples(result, "tilt").values, np.nan)
 
 
@@ -66,7 +66,7 @@ def rotors(result: Result) -> Figure:
 
 def _draw_rotor_limit_shares(ax: Axes, result: Result) -> None:
     """The greatest of the four rotors of each vehicle, as a share of its limit."""
-    limits = rotor_limits(result.mission)
+    limits = rotor_limit(result.mission)
     share = 100.0 * rotor_forces(result).max(axis=2) / limits
     between = _rotor_nearest_to_limit(result, limits)
     if between is not None:
@@ -77,7 +77,7 @@ def _draw_rotor_limit_shares(ax: Axes, result: Result) -> None:
 
 def _draw_rotors_of_nearest(ax: Axes, result: Result) -> None:
     """The four rotors of the vehicle that comes nearest to its limit, enlarged."""
-    limits, force = rotor_limits(result.mission), rotor_forces(result)
+    limits, force = rotor_limit(result.mission), rotor_forces(result)
     peak = np.fmax.reduce(force, axis=(0, 2)) / limits
     i = int(np.nanargmax(peak))
     e = _rotor_nearest_to_limit(result, limits)

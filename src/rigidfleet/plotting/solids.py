@@ -81,7 +81,7 @@ def drawn_obstacles(
     return near_obstacles
 
 
-def _opacities(shape: DrawnObstacle) -> Floats:
+def _place_opacities(shape: DrawnObstacle) -> Floats:
     """Opacity of a shape at each of its places, as a share of the last one's."""
     n = len(shape.at)
     return np.linspace(_FIRST, 1.0, n) if n > 1 else np.ones(1)
@@ -97,7 +97,7 @@ def draw_obstacle_in_space(ax: Axes3D, shape: DrawnObstacle) -> None:
     faces = shape.surface.triangles
     if shape.plain:  # its sides, as seams between translucent triangles would show
         faces = np.concatenate([faces[:6], faces[6:, 2:]], axis=1)
-    for at, share in zip(shape.at, _opacities(shape), strict=True):
+    for at, share in zip(shape.at, _place_opacities(shape), strict=True):
         opacity = 0.07 if shape.zone else 0.2 if shape.plain else 0.25
         opacity *= float(share)
         paint = to_rgba(colour, opacity)
@@ -152,7 +152,7 @@ def draw_obstacle_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     # A terrain has its contours: a corner of it shows how wide it is.
     low, high = points.min(axis=0), points.max(axis=0)
     corner = Path([low, [high[0], low[1]], high])
-    for at, share in zip(shape.at, _opacities(shape), strict=True):
+    for at, share in zip(shape.at, _place_opacities(shape), strict=True):
         opacity = 0.0 if shape.is_terrain else 0.3 if not shape.zone else 0.1
         path = corner if shape.is_terrain else area_from_above(shape.surface.triangles + at)
         patch = ax.add_patch(PathPatch(path, **look, alpha=opacity * float(share)))

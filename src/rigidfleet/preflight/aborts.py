@@ -52,12 +52,12 @@ class AbortsCheck(Shown):
             text += f"; no two vehicles come nearer than {self.least_separation:.2f} m"
         to = "any place" if options.to == "any" else "their own places"
         parts = [
-            FactTable(heads, [*self._abort_rows()], ("way home", "one that does not hear")),
+            FactTable(heads, [*self._rows_by_answer()], ("way home", "one that does not hear")),
             Line(text, "ok" if 0 < ways == all_ else "note"),
         ]
         return Sheet(name, f"aborts, {options.reaction:g} s after each order, to {to}", parts)
 
-    def _abort_rows(self) -> Iterator[Row]:
+    def _rows_by_answer(self) -> Iterator[Row]:
         both = zip(self.aborts, self.unheard, strict=True)
         for _, group in itertools.groupby(
             both, lambda x: re.sub(r"[\d.]+", "#", x[0].home.way or x[0].home.reason)

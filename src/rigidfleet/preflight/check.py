@@ -25,7 +25,7 @@ from rigidfleet.preflight.gains import check_pid_gains, gain_remarks
 from rigidfleet.preflight.losses import loss_remarks
 from rigidfleet.preflight.margins import check_margins, loop_remarks
 from rigidfleet.preflight.network import check_network, network_remarks
-from rigidfleet.preflight.obstacles import boundary_remarks, obstacle_remarks
+from rigidfleet.preflight.obstacles import area_remarks, obstacle_remarks
 from rigidfleet.preflight.offsets import steady_offset_remarks
 from rigidfleet.preflight.vehicles import check_vehicles, vehicle_remarks
 
@@ -83,7 +83,7 @@ def check(
         *trajectory.disturbance_remarks(mission, preflight),
         *steady_offset_remarks(mission, preflight),
         *obstacle_remarks(mission, preflight),
-        *boundary_remarks(mission, preflight),
+        *area_remarks(mission, preflight),
         *trajectory.limit_remarks(mission, preflight),
         *trajectory.waypoint_miss_remarks(mission, preflight),
         *loss_remarks(mission, preflight),

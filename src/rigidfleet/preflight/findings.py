@@ -212,7 +212,7 @@ class FormationNetwork:
     unheard_edges: int = 0
 
     @property
-    def tolerates_network(self) -> bool:
+    def bears_own_network(self) -> bool:
         """Whether the mission's own network is within what the formation bears."""
         share = -1.0 if self.loss is None else self.loss
         within = self.own_loss <= share and self.own_delay_ticks <= self.delay_ticks

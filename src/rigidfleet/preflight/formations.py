@@ -144,7 +144,7 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         yield _note(f"to limit the time of the check, {names_with_verb(skipped)} skipped")
     if idle := [f.name for f in formations if f.held_by == "nothing"]:
         yield _note(f"{names_with_verb(idle)} not used in any phase")
-    yield from _stuck_flat_remarks(mission)
+    yield from _flat_start_remarks(mission)
     soft = {
         f.name
         for f in formations
@@ -197,7 +197,7 @@ def _dimension_spanned(points: Floats, *moves: Floats) -> int:
     return distance_geometry.dimension(x)
 
 
-def _stuck_flat_remarks(mission: Mission) -> Iterator[Remark]:
+def _flat_start_remarks(mission: Mission) -> Iterator[Remark]:
     """Remark on agents that start on a line or in a plane, which forces along their edges cannot move them off."""
     unequal, moves = len(set(mission.agents.mass)) > 1, [centred(mission.fleet.velocity)]
     formed = turned = False

@@ -19,7 +19,7 @@ from rigidfleet.planning.preview import (
 )
 from rigidfleet.planning.reference import copy_with
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
-from rigidfleet.preflight.obstacles import boundary_remarks, obstacle_remarks
+from rigidfleet.preflight.obstacles import area_remarks, obstacle_remarks
 from rigidfleet.preflight.trajectory import downwash_remarks, limit_remarks, separation_remarks
 from rigidfleet.rigidity import analyse
 
@@ -56,7 +56,7 @@ def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         mission, preflight.formations, preflight.gains, [sample_leg(x, most) for x in way]
     )
     for judge in (
-        separation_remarks, downwash_remarks, obstacle_remarks, boundary_remarks, limit_remarks,
+        separation_remarks, downwash_remarks, obstacle_remarks, area_remarks, limit_remarks,
     ):  # fmt: skip
         yield from judge(mission, part)
     yield from _wreck_remarks(Aborts(mission, legs, mission.lost_at <= first), part.planned_phases)

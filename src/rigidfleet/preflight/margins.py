@@ -14,7 +14,7 @@ from rigidfleet.math.margins import (
     Loop,
     LoopGains,
     Margins,
-    formation_loops,
+    distinct_formation_loops,
     largest_stable_pole,
     stability_margins,
     tracking_loops,
@@ -102,7 +102,7 @@ def loops_and_omission(
             if key in seen:
                 continue
             seen.add(key)
-            loops = formation_loops(r, edges, mission.agents.mass, law, lags)
+            loops = distinct_formation_loops(r, edges, mission.agents.mass, law, lags)
             size = sum(len(loop.S) ** 3 for loop in loops)
             if work + size > _WORK and laws:
                 skipped = True

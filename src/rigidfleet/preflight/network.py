@@ -73,7 +73,7 @@ def check_network(
             flight.n / (radio.every * radio.tick), radio.tick, delay, latest, loss, own.loss, growing, unheard
         )  # fmt: skip
         each = (check, checks.get(name, check))
-        checks[name] = min(each, key=lambda f: (f.tolerates_network, f.delay_ticks, f.loss or 0.0))
+        checks[name] = min(each, key=lambda f: (f.bears_own_network, f.delay_ticks, f.loss or 0.0))
     return checks
 
 
@@ -106,7 +106,7 @@ def _ticks_per_law(mission: Mission) -> int:
     return max(1, round(mission.autopilot.rate / mission.autopilot.formation_rate))
 
 
-def growth_at_delay(flight: LinearFlight, delay: int, accuracy: float = _FINE[0]) -> float:
+def growth_rate_at_delay(flight: LinearFlight, delay: int, accuracy: float = _FINE[0]) -> float:
     """Greatest growth [1/s] of a motion if all messages arrive after ``delay`` ticks; about 0 at least.
 
     Free motions of the whole formation, and integrals of stresses that no vehicle feels, neither grow nor decay.
@@ -159,13 +159,13 @@ def last_stable_delay(flight: LinearFlight) -> int:
 def _last_delay(flight: LinearFlight, first: int, most: int, accuracy: float, growth: float) -> int:
     """Last delay in ticks up to ``most`` at which motions grow by less, looked for from ``first`` on."""
     low, high = 0, first
-    while growth_at_delay(flight, high, accuracy) < growth:
+    while growth_rate_at_delay(flight, high, accuracy) < growth:
         if high == most:
             return most
         low, high = high, min(2 * high, most)
     while high - low > 1:
         middle = (low + high) // 2
-        stable = growth_at_delay(flight, middle, accuracy) < growth
+        stable = growth_rate_at_delay(flight, middle, accuracy) < growth
         low, high = (middle, high) if stable else (low, middle)
     return low
 
@@ -269,7 +269,7 @@ def network_remarks(preflight: Preflight) -> Iterator[Remark]:
         if far := f.unheard_edges:
             text = f"'{name}': {far} edges are longer than the range of the network: nobody hears along them"
             yield Remark("note", "network", text)
-        if f.tolerates_network:
+        if f.bears_own_network:
             continue
         share, what = f.growing or 0.0, f"{100 * f.own_loss:.0f} % of its messages are lost"
         why, remedy = what, "lower network.loss, raise network.rate, or slow the constraint law"

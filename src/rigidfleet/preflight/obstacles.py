@@ -35,7 +35,7 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
     within = np.array(
         [[planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))] for planned in way]
     )
-    bounds = [_distance_bound(within, thing) for thing in mission.obstacles]
+    bounds = [_least_distance_bound(within, thing) for thing in mission.obstacles]
     far = np.stack(bounds, axis=1) - radius.max()
     compared, skipped = 0, []
     unproved: dict[int, float] = {}
@@ -93,7 +93,7 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
     yield from _box_gap_remarks(mission, preflight, radius)
 
 
-def boundary_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
+def area_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on planned paths that cross a fence, and on places where vehicles would fall that are too near people.
 
     Between samples of a plan, its paths are quintics through positions, velocities and accelerations.
@@ -116,7 +116,7 @@ def boundary_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             yield Remark("fails" if exact and limit is not None else "note", q.who, text)
 
 
-def _distance_bound(within: Floats, thing: Obstacle) -> Floats:
+def _least_distance_bound(within: Floats, thing: Obstacle) -> Floats:
     """Lower bound (L,) [m] of the distance of boxes (L, 2, 3), given by lowest and highest corner, to an obstacle.
 
     Minus infinity where a box overlaps the obstacle's extent: how deep it reaches into the obstacle is not known.

@@ -16,7 +16,7 @@ import numpy as np
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, rigid_body
-from rigidfleet.math.margins import constraint_share_matrix
+from rigidfleet.math.margins import constraint_filter_matrix
 from rigidfleet.math.pid import matrix_exponential
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import PlannedPhase
@@ -39,7 +39,7 @@ _SHAPES = 16
 _SMALL = 0.05
 
 
-def sampled_slot_offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
+def sampled_tracking_offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
     """Offsets (K, N, 3) [m] of the vehicles from their slots in each planned phase; zeros where none are tracked."""
     tracked = [planned.leg.phase.control == "tracking" for planned in way]
     pushes = [
@@ -98,7 +98,7 @@ def _offsets_of_both_laws(
     law, root = phase_gains(mission, planned.leg.phase, name), np.repeat(np.sqrt(masses), 3)
     law = replace(law, damping=_SMALL * law.damping)
     for part in np.array_split(np.arange(len(free)), _SHAPES):
-        S = constraint_share_matrix(planned.position[part[len(part) // 2]], edges, masses, law)
+        S = constraint_filter_matrix(planned.position[part[len(part) // 2]], edges, masses, law)
         mixed = answers[part, 0] + (answers[part, 1] - answers[part, 0]) * root @ S / root
         free[part] = mixed.reshape(-1, *free.shape[1:])
     return free
@@ -117,7 +117,7 @@ def steady_offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Re
     if not mission.tracking.integral:
         remedy = f"; tracking has no integral: raise the first weight in tracking.Q (now {mission.tracking.Q[0]:g})"
         remedy += ", or set tracking.integral" if mission.vehicle_models is not None else ""
-    for planned, off in zip(way, sampled_slot_offsets(mission, way), strict=True):
+    for planned, off in zip(way, sampled_tracking_offsets(mission, way), strict=True):
         far = float(np.linalg.norm(off, axis=2).max())
         if planned.leg.end > mission.first_loss or far < _LEAST:
             continue

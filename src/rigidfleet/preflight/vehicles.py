@@ -58,8 +58,8 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
         x = series.taylor_derivatives(slots).transpose(3, 0, 2, 1)
         for i, model in enumerate(models):
             if not model.point:
-                need = _needs_of_path(model, x[:, :, i], yaw[:, :, i], mission.gravity)
-                needs.append(_needs_of_phase(model, need, time, f"agent {i + 1}", planned.phase))
+                need = _vehicle_needs_on_path(model, x[:, :, i], yaw[:, :, i], mission.gravity)
+                needs.append(_vehicle_check(model, need, time, f"agent {i + 1}", planned.phase))
     jump = _worst_accel_and_tilt_jump(mission, tracked)
     return VehicleCheck(
         rotor_force=max((x.rotor_force for x in needs), key=lambda force: force[0] / force[3]),
@@ -69,7 +69,7 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
     )
 
 
-def _needs_of_phase(
+def _vehicle_check(
     model: VehicleModel, need: Flat, time: Floats, who: str, phase: str
 ) -> VehicleCheck:
     """What a phase asks of one vehicle."""
@@ -94,7 +94,7 @@ def _needs_of_phase(
     )
 
 
-def _needs_of_path(model: VehicleModel, x: Floats, yaw: Floats, g: float) -> Flat:
+def _vehicle_needs_on_path(model: VehicleModel, x: Floats, yaw: Floats, g: float) -> Flat:
     """What a path (K, 5, 3) asks of a vehicle: the force of m (a + g) and of drag, and its derivatives."""
     force = model.mass * x[:, 2:] + np.array(model.linear_drag) * x[:, 1:4]
     speed = np.linalg.norm(x[:, 1], axis=1)[:, None]

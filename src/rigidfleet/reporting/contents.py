@@ -21,7 +21,7 @@ from rigidfleet.plotting.areas import draw_ground, fall_places_by_sample
 from rigidfleet.plotting.quadrotors import (
     has_rotors,
     rotor_forces,
-    rotor_limits,
+    rotor_limit,
     tilt,
 )
 from rigidfleet.plotting.style import clean_name
@@ -179,7 +179,7 @@ def _vehicles_table(result: Result) -> FactTable:
         "lowest [m]": [-x for x in greatest_of_each(-z) if x is not None],
         "highest [m]": greatest_of_each(z),
         "path length [m]": np.linalg.norm(np.diff(result.position, axis=0), axis=2).sum(axis=0).tolist(),
-        "share of rotor limit": share_of_limit(rotor_forces(result), rotor_limits(mission)[..., None])
+        "share of rotor limit": share_of_limit(rotor_forces(result), rotor_limit(mission)[..., None])
         if rotors else nothing,
         "tilt [deg]": greatest_of_each(tilt(result)) if rotors else nothing,
         "from the slot [m]": greatest_by_name("tracking_error") if rotors else nothing,

@@ -124,9 +124,9 @@ def _distance_beyond_fence(result: Result) -> tuple[Floats, ...]:
 
 def _boundary_distances(result: Result, name: str) -> tuple[Any, ...]:
     """Distance (K, N) [m] beyond a fence, or of where a fall ends from people."""
-    from rigidfleet.mission.boundaries import Boundaries, areas_of  # takes long to load
+    from rigidfleet.mission.boundaries import Boundaries, areas_judged_by  # takes long to load
 
-    if not areas_of(result.mission, name):
+    if not areas_judged_by(result.mission, name):
         return (np.full(result.left.shape, np.nan),)
     values, number = Boundaries(result.mission).values(name, result.position, result.velocity)
     return mask_lost(result, values), lambda k, i: (i, int(number[k, i]))

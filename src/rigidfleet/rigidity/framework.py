@@ -151,7 +151,7 @@ def localised_flexes(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
 def _candidate_flexes(frame: Framework) -> Iterator[Floats]:
     """Flexes (N, d) among which there is a basis, those that move few agents first."""
     yield from _motions_of_single_agents(frame)
-    few = sparse_flexes(frame.flexes, frame.rigid_basis, len(frame.p))
+    few = few_agent_flexes(frame.flexes, frame.rigid_basis, len(frame.p))
     yield from sorted(few, key=_number_of_movers)
     yield from frame.flexes.T.reshape(-1, *frame.p.shape)
 
@@ -186,7 +186,7 @@ def _motions_of_single_agents(frame: Framework) -> Iterator[Floats]:
             yield motion
 
 
-def sparse_flexes(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) -> list[Floats]:
+def few_agent_flexes(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) -> list[Floats]:
     """Flexes (N, d) that move few agents: for each agent, the one with the least sum of speeds in which it moves.
 
     It moves in the direction in which flexes can move it most; if there are several, in each of them.

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigidfleet.rigidity.framework import Framework, sparse_flexes
+from rigidfleet.rigidity.framework import Framework, few_agent_flexes
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: A stress blocks all flexes if its least energy exceeds this share of its greatest energy.
@@ -152,7 +152,7 @@ def deform_by_finite_flex(energy: StressEnergy) -> tuple[Floats | None, bool]:
     frame = energy.frame
     if energy.k == 0:
         return None, False  # a stress nearly blocks every flex
-    few = sparse_flexes(energy.flexes, frame.rigid_basis, energy.n, _STARTS)
+    few = few_agent_flexes(energy.flexes, frame.rigid_basis, energy.n, _STARTS)
     candidates = [energy.flexes.T @ motion.ravel() for motion in few]
     candidates += list(np.random.default_rng(0).normal(size=(_STARTS, energy.k)))
     goes_on = False

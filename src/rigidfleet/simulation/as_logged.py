@@ -285,7 +285,7 @@ def replace_ways(plan: Result, planned: Piecewise, way: Piecewise, spans: list[A
             fastest = watch_curve(watch, way.between(since, until), grid, spans)
             extremes = watch.end_phase() | fastest
         records.append(replace(record, extremes=extremes, settled=None, controller=None))
-    watch.keep_only(np.ones(plan.n_agents, dtype=np.bool_))
+    watch.keep_agents(np.ones(plan.n_agents, dtype=np.bool_))
     watch.add_extremes_to_phases(records)
     every = {name: getattr(plan, name) for name in _PLANNED}
     known: dict[str, Any] = {name: x[inside] for name, x in every.items() if x is not None}

@@ -65,12 +65,12 @@ def diagnose(at: ActivePhase, *, own_force: bool, collapsed: bool) -> str:
         bound = "no bound" if solver == "exact" else "no bound except its cut-off"
         return (
             f'{head}, and {where}. The force of solver "{solver}" has {bound} where a singular value'
-            f' vanishes. Use solver = "iterated" (or "spectral"){_smoothing_advice(at.plan)}'
+            f' vanishes. Use solver = "iterated" (or "spectral"){_unbounded_law_advice(at.plan)}'
         )
     return f"{head}, and {where}. {remedy()}"
 
 
-def _smoothing_advice(plan: PhasePlan) -> str:
+def _unbounded_law_advice(plan: PhasePlan) -> str:
     """What else helps a law without bound: a smooth reference, feedback; "" if it has both."""
     words = ""
     shaping = plan.phase.shaping

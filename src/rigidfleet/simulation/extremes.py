@@ -139,7 +139,7 @@ class CurveWatch:
         count[records.TRAILED] = len(clock)
         self.monitor_paths(problem, work, state._replace(trail=trail, count=count))
 
-    def keep_only(self, left: Bools) -> None:
+    def keep_agents(self, left: Bools) -> None:
         """Continue with the vehicles ``left`` (N,) alone, as if the others were not there."""
         self.left[:] = left
         self._list_all_pairs()
@@ -150,7 +150,7 @@ class CurveWatch:
     def deepest_contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far; None if there was none."""
         contacts = [
-            x for x in (self._extremum(records.FLYING), self._landing_clearance()) if x is not None
+            x for x in (self._extremum(records.FLYING), self._stay_clearance()) if x is not None
         ]
         deepest = min(contacts, key=lambda x: x.value, default=None)
         return deepest if deepest is not None and deepest.value < -_TOUCH else None
@@ -184,7 +184,7 @@ class CurveWatch:
         for name, kind in _CONTACTS.items():
             if name in self.touched or not self.worst[kind] < -_TOUCH:
                 continue
-            deepest = partial(self._deepest_of_kind, kind, problem, work, state)
+            deepest = partial(self._deepest_contact_of_kind, kind, problem, work, state)
             rows = _trail_rows(state, step_indices)
             steps, points = state.trail.clock[rows], state.trail.points[rows]
             while steps[-1].sum() - steps[0, 0] > _INSTANT:
@@ -196,7 +196,7 @@ class CurveWatch:
             if (contact := deepest(steps, points)) is not None:
                 self.touched[name] = contact
 
-    def _deepest_of_kind(
+    def _deepest_contact_of_kind(
         self, kind: int, problem: Problem, work: Workspace, state: Any, *steps: Floats
     ) -> Extremum | None:
         """The deepest contact of a kind in steps (S, 2), (S, 5, n) of an integrator; None if there is none."""
@@ -247,13 +247,13 @@ class CurveWatch:
         extremes: dict[str, Extremum | None] = dict(self.touched)
         if self.solids is not None or len(self.boxes):
             extremes |= {name: self._extremum(k) for name, k in _OF_FLIGHT.items()}
-            extremes["clearance_end"] = self._landing_clearance()
+            extremes["clearance_end"] = self._stay_clearance()
         for name, x in extremes.items():
             if x is not None:
                 last = [p for p in phases if p.t_start <= x.time] or phases
                 last[-1].extremes[name] = x
 
-    def _landing_clearance(self) -> Extremum | None:
+    def _stay_clearance(self) -> Extremum | None:
         """The least clearance of an agent that has stayed near since, as it may be landing; None if there is none."""
         near = self.low[:, 0]
         if math.isfinite(near.min()):

@@ -293,7 +293,7 @@ def result_of_curve(
     grid = time[0] + near * np.arange(1, math.ceil(span / near))
     fastest = watch_curve(watch, curve, grid, spans)
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
-    watch.keep_only(np.ones(n, dtype=np.bool_))  # whose data end near an obstacle has not left it
+    watch.keep_agents(np.ones(n, dtype=np.bool_))  # whose data end near an obstacle has not left it
     record.extremes.update(watch.end_phase())
     watch.add_extremes_to_phases([record])
     record.extremes.update(fastest)
@@ -448,7 +448,7 @@ def _watch_positions(
     starts = np.union1d(np.arange(0, len(here), together), change)
     for first, last in pairwise([*starts.tolist(), len(here)]):
         if spans:
-            watch.keep_only(here[first])
+            watch.keep_agents(here[first])
         if not here[first].any():
             continue
         part = way.with_knots(knots[first : last + 1])

@@ -161,7 +161,7 @@ def vector_from_solid_surface(x: Numbers, y: Numbers, z: Numbers, b: int, solids
     t = solids.triangles[first[1]]
     i, j, k = x - t[0, 0], y - t[0, 1], z - t[0, 2]
     if solids.kind[b] == HEIGHTS:  # straight below
-        u, v, h = height_map_point(x, y, b, solids)
+        u, v, h = point_on_height_map(x, y, b, solids)
         i, j, k = x - u, y - v, z - h
     best = i * i + j * j + k * k
     node = first[0]
@@ -178,7 +178,7 @@ def vector_from_solid_surface(x: Numbers, y: Numbers, z: Numbers, b: int, solids
     return i, j, k, best
 
 
-def height_map_point(x: Numbers, y: Numbers, b: int, solids: Any) -> Any:
+def point_on_height_map(x: Numbers, y: Numbers, b: int, solids: Any) -> Any:
     """The point (x, y, height) of a height map straight below or above the point, or its nearest rim."""
     size, first = solids.size[b], solids.first[b, 2]
     n, m = solids.grid[b, 0], solids.grid[b, 1]
@@ -199,7 +199,7 @@ def is_inside(x: Numbers, y: Numbers, z: Numbers, b: int, solids: Any) -> Any:
     if not any_true(inside):
         return inside
     if solids.kind[b] == HEIGHTS:
-        _, _, height = height_map_point(x, y, b, solids)
+        _, _, height = point_on_height_map(x, y, b, solids)
         return inside & (z <= height)
     for m in range(solids.first[b, 1], solids.last[b, 1]):
         t = solids.triangles[m]
@@ -307,7 +307,7 @@ def height_range(x: Numbers, y: Numbers, b: int, solids: Any) -> Any:
     x, y = where(np.isfinite(x), x, _FAR) - o[0], where(np.isfinite(y), y, _FAR) - o[1]
     if solids.turned[b] == 0 or solids.kind[b] == HEIGHTS:
         over = (x >= size[0]) & (x <= size[3]) & (y >= size[1]) & (y <= size[4])
-        top = height_map_point(x, y, b, solids)[2] if solids.kind[b] == HEIGHTS else size[5]
+        top = point_on_height_map(x, y, b, solids)[2] if solids.kind[b] == HEIGHTS else size[5]
         return where(over, size[2], math.inf), where(over, top, -math.inf)
     low, top = x * 0.0 - math.inf, x * 0.0 + math.inf
     for k in range(3):
@@ -330,7 +330,7 @@ def height_below(x: Numbers, y: Numbers, z: Numbers, solids: Any) -> Numbers:
 #: The functions that the kernel compiles, each after those that it calls.
 ELEMENTWISE = (
     choose, box_distance, box_normal, cylinder_distance, cylinder_normal,
-    vector_from_segment, edge_side, facet_cross_product, vector_from_triangle, height_map_point,
+    vector_from_segment, edge_side, facet_cross_product, vector_from_triangle, point_on_height_map,
     vector_from_solid_surface, is_inside, signed_distance, outward_normal, solid_displacement, is_solid_present,
     local_point, is_solid_below, height_range, height_below,
 )  # fmt: skip

@@ -522,7 +522,7 @@ class _Check:
             except NotationError as error:
                 self.add(where, error.problem, error.remedy)
                 return None
-        model = self.collector.model_of_kind(entry, where, KINDS)
+        model = self.collector.model_class_of_kind(entry, where, KINDS)
         variation = None if model is None else self.collector.validate(model, entry, where)
         if variation is None or len(self.collector.findings) > before:
             return None

@@ -46,13 +46,13 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
 
 def _judge_fault(sweep: Sweep, run: int) -> RunRecord:
     """Judge a geometric fault of a drill."""
-    show, fault = _show_and_fault(sweep, run)
+    show, fault = _drilled_show_and_fault(sweep, run)
     begun = perf_counter()
     outcome = _value_or_error(lambda: show.measure_fault(fault))
     return _run_row(sweep, run, sweep.values(run), outcome, begun)
 
 
-def _show_and_fault(sweep: Sweep, run: int) -> tuple[faults.Show, faults.GeometricFault]:
+def _drilled_show_and_fault(sweep: Sweep, run: int) -> tuple[faults.Show, faults.GeometricFault]:
     """The show of a drill, and the geometric fault of a run."""
     show, (kind, size, count) = faults.show_of(sweep.mission.text, sweep.drill), sweep.values(run)
     who = faults.vehicles_of(sweep.seed, show.n, count, run // math.prod(sweep.grid_sizes.values()))
@@ -65,7 +65,7 @@ def flight_of_fault(sweep: Sweep, run: int) -> tuple[Result, Ints]:
 
     if sweep.values(run)[0] in faults.FLOWN:
         return simulate(sweep.mission_of(run)), np.arange(sweep.mission.n_agents)
-    show, fault = _show_and_fault(sweep, run)
+    show, fault = _drilled_show_and_fault(sweep, run)
     return show.flight_near_fault(fault)
 
 

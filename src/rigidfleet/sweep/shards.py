@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidfleet.errors import ResultError, RigidfleetError
 from rigidfleet.sweep.run import GROUP
-from rigidfleet.sweep.store import FILE, Store, Table, diff_text, outcome_of, read, store_contents
+from rigidfleet.sweep.store import FILE, Store, Table, diff_names, outcome_of, read, store_contents
 from rigidfleet.typing import Bools, Ints
 
 #: Folder of the shards in the folder of their sweep.
@@ -63,7 +63,7 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
     rows: dict[int, tuple[Path, tuple[Any, ...]]] = {}
     for path, (_, own, part) in zip(paths, stored, strict=True):
         if own != common:
-            other = diff_text(common, own)
+            other = diff_names(common, own)
             raise ResultError(f"{path}: does not fit {paths[0]}; it differs in: {other}. {_MOVE}")
         for row in part:
             where, same = rows.setdefault(row[0], (path, row))

@@ -147,7 +147,7 @@ class Store:
                 self.db.execute(f'ALTER TABLE runs ADD "{name}" {_KINDS.get(name, "REAL")}')
             there = dict(self.db.execute("SELECT key, value FROM sweep"))
             if there and there.get("identity") != identity:
-                other = diff_text(json.loads(there.get("identity", "{}")), json.loads(identity))
+                other = diff_names(json.loads(there.get("identity", "{}")), json.loads(identity))
                 raise ResultError(
                     f"{self.path.parent}: contains another sweep; it differs in: {other}. Use --force to overwrite, or"
                     " --out to choose another folder."
@@ -258,7 +258,7 @@ def _as_result_errors(path: Path) -> Generator[None]:
         raise unwritable_error(path.parent, error) from error
 
 
-def diff_text(old: dict[str, Any], new: dict[str, Any]) -> str:
+def diff_names(old: dict[str, Any], new: dict[str, Any]) -> str:
     """Names of what differs between two sweeps, as `Sweep.identity` and `store_contents` have it."""
     names = {
         "vary": "variations",

@@ -28,7 +28,7 @@ KEY = "RIGIDFLEET_LEVEL"
 
 
 @cache
-def instruction_levels() -> tuple[str, ...]:
+def machine_instruction_levels() -> tuple[str, ...]:
     """The levels that this machine runs, the lowest first; none where there are no levels."""
     if sys.platform != "linux" or platform.machine() != "x86_64":
         return ()
@@ -42,7 +42,7 @@ def instruction_levels() -> tuple[str, ...]:
 
 def target_instruction_level() -> str:
     """The level to compile for: that which the environment fixes, or the highest that the machine runs, or `HOST`."""
-    return os.environ.get(KEY) or (HOST, *instruction_levels())[-1]
+    return os.environ.get(KEY) or (HOST, *machine_instruction_levels())[-1]
 
 
 def runnable_instruction_level() -> str:
@@ -53,7 +53,7 @@ def runnable_instruction_level() -> str:
     RigidfleetError
         The environment fixes a level that is unknown, or that this machine cannot run.
     """
-    runs = instruction_levels() or (HOST,)
+    runs = machine_instruction_levels() or (HOST,)
     if (chosen := target_instruction_level()) not in runs:
         raise RigidfleetError(
             f"{KEY}: this machine cannot run {chosen!r}. Choose {' or '.join(runs)}, or unset it."

@@ -122,7 +122,7 @@ def _write_state(k, row, coordinates, w, x, hc, s):
 
 
 @jit_inline
-def _write_trial_state(k, coordinates, s, h):
+def _write_trial_of_stage(k, coordinates, s, h):
     """Write the state of stage s, a literal."""
     _write_state(k, TRIAL, coordinates, _weights(A[s], h), _weights(_AA[s], h * h), h * C[s], s)
 
@@ -142,21 +142,21 @@ def write_stage_state(k, stage, _a, h, p):
         for q in range(k.shape[1]):
             k[TRIAL, q] = k[STATE, q]
     elif stage == 1:
-        _write_trial_state(k, coordinates, 1, h)
+        _write_trial_of_stage(k, coordinates, 1, h)
     elif stage == 2:
-        _write_trial_state(k, coordinates, 2, h)
+        _write_trial_of_stage(k, coordinates, 2, h)
     elif stage == 3:
-        _write_trial_state(k, coordinates, 3, h)
+        _write_trial_of_stage(k, coordinates, 3, h)
     elif stage == 4:
-        _write_trial_state(k, coordinates, 4, h)
+        _write_trial_of_stage(k, coordinates, 4, h)
     elif stage == 5:
-        _write_trial_state(k, coordinates, 5, h)
+        _write_trial_of_stage(k, coordinates, 5, h)
     elif stage == 6:
-        _write_trial_state(k, coordinates, 6, h)
+        _write_trial_of_stage(k, coordinates, 6, h)
     elif stage == 7:
-        _write_trial_state(k, coordinates, 7, h)
+        _write_trial_of_stage(k, coordinates, 7, h)
     else:
-        _write_trial_state(k, coordinates, 8, h)
+        _write_trial_of_stage(k, coordinates, 8, h)
 
 
 @jit_inline

@@ -11,7 +11,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.plotting import agent_colours
 from rigidfleet.plotting.areas import fall_places_by_sample
 from rigidfleet.plotting.logged import off_plan
-from rigidfleet.plotting.quadrotors import has_rotors, rotor_forces, rotor_limits
+from rigidfleet.plotting.quadrotors import has_rotors, rotor_forces, rotor_limit
 from rigidfleet.result import quantities
 from rigidfleet.result.lights import has_lights, light_colours
 from rigidfleet.solids.outline import outline_of_solid
@@ -32,23 +32,23 @@ _BESIDE = 0.15
 _FLOOR = 1e-6  # least constraint error that is distinguished from zero [m]
 
 
-def describe_scene(result: Result, shown: Ints, tension: float) -> dict[str, Any]:
-    """Description of obstacles, fences, people, vehicles, the edges ``shown``, and plots.
+def describe_scene(result: Result, shown_edges: Ints, max_tension: float) -> dict[str, Any]:
+    """Description of obstacles, fences, people, vehicles, ``shown_edges`` by number, and plots.
 
-    Full colour of an edge stands for ``tension`` [N].
+    Full colour of an edge stands for ``max_tension`` [N].
     """
     mission = result.mission
     boxes = [(o.name, o.box_bounds) for o in mission.obstacles if is_plain_box(o) and o.box_bounds]
     fence = mission.limits.geofence
-    rotors = {"rotors": np.isfinite(rotor_limits(mission)).tolist()} if has_rotors(result) else {}
+    rotors = {"rotors": np.isfinite(rotor_limit(mission)).tolist()} if has_rotors(result) else {}
     return {
         "name": mission.name,
         "title": mission.title,
         "radius": mission.agents.radius,
         "colours": agent_colours(mission.n_agents),
         **rotors,
-        "edges": result.edges[shown],
-        "tension": tension,
+        "edges": result.edges[shown_edges],
+        "tension": max_tension,
         "boxes": [{"name": name, "min": ends[:3], "max": ends[3:]} for name, ends in boxes],
         "solids": [_solid_surface(o) for o in mission.solids if not is_plain_box(o)],
         "fence": None if fence is None else {"min": fence.min, "max": fence.max},
@@ -127,7 +127,7 @@ def _tensions(result: Result, shown: Ints) -> Floats:
 def _attitude_columns(result: Result) -> Iterator[tuple[str, PackedColumn]]:
     """Samples that turn vehicles: attitudes and shares of the rotors' limits, and of points the thrust's direction."""
     mission = result.mission
-    limits = rotor_limits(mission)
+    limits = rotor_limit(mission)
     known = np.isfinite(limits) & has_rotors(result)
     if not known.all():
         force = result.input_force + result.constraint_force
@@ -233,7 +233,7 @@ def _plots(result: Result) -> Iterator[tuple[dict[str, Any], PackedColumn]]:
         return basic | look, PackedColumn(values, step)
 
     if has_rotors(result):
-        share = 100.0 * rotor_forces(result).max(axis=2) / rotor_limits(mission)
+        share = 100.0 * rotor_forces(result).max(axis=2) / rotor_limit(mission)
         look: dict[str, Any] = {"unit": "%", "colours": colours, "limits": [100.0] * len(colours)}
         yield plot_entry("rotor", "Rotors, share of limit", _envelope_if_many(share), 0.1, **look)
     elif off is None and result.interpolation is None:  # else nobody knows the thrust
