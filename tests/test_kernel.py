@@ -283,6 +283,8 @@ def test_jacobi_finds_all_eigenvalues(values):
     np.testing.assert_allclose(V.T @ V, np.eye(n), rtol=0, atol=1e-14)
     np.testing.assert_allclose(V @ np.diag(found) @ V.T, A, rtol=0, atol=2e-15 * scale)
     assert largest == found.max()
+    # It ends as nothing is left to rotate, not as its sweeps are used up.
+    assert (np.tril(lower, -1) ** 2).sum() <= 1e-32 * (A**2).sum()
 
 
 def test_jacobi_keeps_small_eigenvalues_accurate():
