@@ -149,8 +149,8 @@ def reference_kind(
     """
     if phase.reference != "distances":
         return phase.reference
-    if target is None or not mission.formations[phase.formation].knows_slots:
-        return "squares"
+    if target is None or len(target) < 4 or not mission.formations[phase.formation].knows_slots:
+        return "squares"  # three agents lie in a plane
     edges = mission.formation_edges(phase.formation)
     lengths = mission.formation_distances(phase.formation)
     if not np.allclose(distance_geometry.distances(target, edges), lengths, rtol=1e-3):
