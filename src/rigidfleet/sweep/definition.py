@@ -352,8 +352,7 @@ class Sweep:
         with suppress(MissionError):  # errors are told of the mission as written
             document = self.document_of_run(run, values, self._document_with_ways)
             return Mission.from_plain(document, f"run {run}", validated=self._validated)
-        document = self.document_of_run(run, values)
-        return Mission.from_plain(document, f"run {run}", validated=self._validated)
+        return Mission.from_plain(self.document_of_run(run, values), f"run {run}")
 
     @cached_property
     def _document_with_ways(self) -> dict[str, Any]:
