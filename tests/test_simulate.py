@@ -1206,8 +1206,8 @@ def test_numbers_by_edge_are_kept_edge_by_edge():
         .with_values(other, np.array([4.0, 5.0]))
     )
     asked = np.array([[2, 5], [0, 7], [0, 1], [1, 2], [0, 2]])
-    np.testing.assert_array_equal(numbers.values_of(asked, 9.0), [2.0, 5.0, 1.0, 4.0, 9.0])
-    np.testing.assert_array_equal(ByEdge().values_of(some, np.arange(3.0)), [0.0, 1.0, 2.0])
+    np.testing.assert_array_equal(numbers.values_of(asked, lambda: 9.0), [2.0, 5.0, 1.0, 4.0, 9.0])
+    np.testing.assert_array_equal(ByEdge().values_of(some, lambda: np.arange(3.0)), [0.0, 1.0, 2.0])
 
 
 def test_a_result_knows_the_mission_that_was_flown():

@@ -22,6 +22,8 @@ from rigidfleet.mission.schema import Formation
 _SHOWN = 6
 #: Light of vehicles that rest.
 _DARK = "#000000"
+#: Number of points below which all distances are compared first.
+_FEW = 100
 #: Approximate maximum number of triangles and tetrahedra that are checked among distances.
 _MOST_CLIQUES = 5e6
 
@@ -34,7 +36,7 @@ def has_no_findings(m: FindingCollector, name: str) -> bool:
 def coincident_pairs(points: ArrayLike) -> list[tuple[int, int]]:
     """Pairs (first, later) of points (N, 3) [m] that are closer than half the smallest length."""
     p, apart = np.asarray(points, dtype=np.float64), bounds.LENGTH.least / 2
-    if len(p) < 2:
+    if len(p) < 2 or (len(p) < _FEW and proximity.nearest(p).min() > 2.0 * apart):
         return []
     # Cells first: a search tree of many equal points degenerates and compares all pairs.
     _, one, cell = np.unique(np.round(p / apart), axis=0, return_index=True, return_inverse=True)

@@ -459,7 +459,7 @@ def _formation_use_rules(m: Draft, phases: Written) -> Breaches:
             continue
         if held in slotted:
             continue
-        if form.slot_array(m.n) is None:
+        if form.distances is not None and form.slot_array(m.n) is None:
             problem = f"formation '{held}' has no slots to track"
             remedy = f"give formations.{toml_key(held)} a shape or slots, or change control"
             yield Breach((*path, "control"), problem, remedy, p.control)
@@ -477,14 +477,13 @@ def _formation_existence_rules(m: Draft, name: str, *where: str | int) -> Breach
 
 def _slot_blend_rules(p: Shaping, form: Formation, n: int, path: Keys) -> Breaches:
     """A formation can be reached by blending slots: it has slots, and distances that agree with them."""
-    if p.reference != "shape":
+    if p.reference != "shape" or form.distances is None:  # without distances, it has slots
         return
-    slots = form.slot_array(n)
-    if slots is None:
+    if (slots := form.slot_array(n)) is None:
         problem = f"formation '{p.formation}' has no slots to blend"
         remedy = "give it a shape or slots, or use reference = 'distances'"
         yield Breach((*path, "reference"), problem, remedy, p.reference)
-    elif form.distances is not None:
+    else:
         edges = form.edge_array(n)
         between = distance_geometry.distances(slots, edges)
         for i in np.flatnonzero(np.abs(between - form.distances) > 1e-3 * between):

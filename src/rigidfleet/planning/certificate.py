@@ -16,6 +16,8 @@ from rigidfleet.typing import Bools, Floats
 
 #: What a certificate of bent ways gives away, so that its search ends [m].
 CLOSE = 1e-6
+#: Number of vehicles up to which all pairs are compared at once.
+_FEW = 100
 #: Shares of a blend's duration, and of the paths flown by then.
 _TAU = np.linspace(0.0, 1.0, 2001)
 _FLOWN = septic_polynomial(_TAU)
@@ -63,15 +65,15 @@ def prove_straight_ways(
 
 def _prove_flying(reference: Reference, radius: Floats, lost: Bools) -> Certificate | None:
     """Certificate of the slots of vehicles that are not ``lost`` (N,)."""
-    left = np.flatnonzero(~lost)
-    if len(left) < 2:
+    if lost.any():
+        left = np.flatnonzero(~lost)
+        proved = _prove_flying(reference_of_agents(reference, left), radius[left], lost[left])
+        return proved and proved._replace(agents=tuple(left[list(proved.agents)].tolist()))
+    if len(lost) < 2:
         return None
-    some, radius = reference_of_agents(reference, left), radius[left]
-    certificate = (
-        prove_ways(some.knots, some.ways, radius) if len(some.knots) else prove_blend(some, radius)
-    )
-    i, j = (int(left[k]) for k in certificate.agents)
-    return certificate._replace(agents=(i, j))
+    if len(reference.knots):
+        return prove_ways(reference.knots, reference.ways, radius)
+    return prove_blend(reference, radius)
 
 
 def prove_blend(reference: Reference, radius: Floats) -> Certificate:
@@ -79,15 +81,18 @@ def prove_blend(reference: Reference, radius: Floats) -> Certificate:
 
     How the virtual body moves and turns meanwhile does not matter to distances.
     """
-    p, dp, time = reference.p0, reference.dp, reference.t0
+    p, dp, time, share = reference.p0, reference.dp, reference.t0, 0.0
     if dp.any():
         separation, pair, share = closest_approach(p, p + dp, radius)
+    elif len(p) > _FEW:
+        (separation,), (pair,) = (x.tolist() for x in proximity.separation(p[None], radius))
     else:
-        (separation,), ((i, j),) = (x.tolist() for x in proximity.separation(p[None], radius))
-        pair, share = (i, j), 0.0
+        i, j = pairs = proximity.all_pairs(len(p))
+        gaps = proximity.root_of_squares((p[j] - p[i]).T) - (radius[i] + radius[j])
+        separation, pair = float(gaps.min()), pairs[:, gaps.argmin()].tolist()
     if share > 0.0:
         time += reference.T_b * float(np.interp(share, _FLOWN, _TAU))
-    return Certificate(separation, time, pair, "closed form")
+    return Certificate(separation, time, tuple(pair), "closed form")
 
 
 def prove_ways(

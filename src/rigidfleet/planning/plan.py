@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import StoppedError
-from rigidfleet.formation import distance_geometry, graphs
+from rigidfleet.formation import distance_geometry
 from rigidfleet.kernel.problem import (
     BODY,
     NO_FEEDBACK,
@@ -42,6 +42,7 @@ from rigidfleet.kernel.problem import (
 )
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
+from rigidfleet.math.proximity import all_pairs
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Mission, Phase, Regulator, bounds
 from rigidfleet.mission.model import part_of_mission
@@ -150,7 +151,7 @@ class PhasePlan(Leg):
     def initial_state(self) -> Floats:
         """The kernel's state vector (n,) at the start; `rigidfleet.kernel.dynamics` says what it holds."""
         now, masses = self.before, self.masses
-        integral = now.integral.values_of(self.edges, 0.0)
+        integral = now.integral.values_of(self.edges, lambda: 0.0)
         if self.frame is None:
             return np.concatenate([now.r.ravel(), now.v.ravel(), integral])
         q = att.quaternion_from_dcm(self.frame)
@@ -239,10 +240,10 @@ def plan_phase(
     _refuse_hopeless_phase(mission, phase, leg.start, edges if method == "dense" else edges[:0])
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if shaping is None:
-        d1 = now.reference.values_of(edges, d1)
+        d1 = now.reference.values_of(edges, lambda: d1)
     reference = leg.reference
     if shaping is not None or now.blend is None:
-        d0 = now.reference.values_of(edges, distance_geometry.distances(now.r, edges))
+        d0 = now.reference.values_of(edges, lambda: distance_geometry.distances(now.r, edges))
         # Distances are those of the slots where these have the lengths commanded.
         agree = shaping is None and phase.control == "tracking" and _agree(d1, reference.p0, edges)
         reference = reference._replace(kind=SHAPE if agree else reference.kind, d0=d0, d1=d1)
@@ -311,11 +312,10 @@ def _refuse_hopeless_phase(mission: Mission, phase: Phase, start: float, edges: 
             f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it end at"
             f" {start:.2f} s. Give it a duration instead of until"
         )
-    n, solver = mission.n_agents, mission.constraint.solver
-    size = solvers.system_size(n, len(edges), solver)
-    if phase.shaping is not None and size > solvers.MOST_DENSE:
+    n, solver, shaping = mission.n_agents, mission.constraint.solver, phase.shaping
+    if shaping and (size := solvers.system_size(n, len(edges), solver)) > solvers.MOST_DENSE:
         raise StoppedError(
-            f"phase '{phase.name}' takes '{phase.shaping.formation}', whose {len(edges):,} edges between"
+            f"phase '{phase.name}' takes '{shaping.formation}', whose {len(edges):,} edges between"
             f' {n:,} agents give {size:,} equations for the constraint force; solver "{solver}" needs'
             f" their eigenvalues; with more than {solvers.MOST_DENSE:,} a flight takes hours. Use solver ="
             ' "iterated" (or "exact"), give it fewer edges, or track slots with edges = []'
@@ -330,7 +330,7 @@ def _name_if_in_formation(mission: Mission, name: str | None, now: PhaseState) -
     both = np.array([slots, now.r])[:, ~now.lost]
     if both.shape[1] < 2:
         return None
-    wanted, lengths = distance_geometry.distances(both, graphs.complete_graph(both.shape[1]))
+    wanted, lengths = distance_geometry.distances(both, all_pairs(both.shape[1]).T)
     return name if (np.abs(lengths - wanted) <= _NEAR * wanted.min()).all() else None
 
 

@@ -5,6 +5,7 @@ Both the plan of a flight and the check before it use them. Nothing here integra
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
@@ -28,15 +29,15 @@ class ByEdge:
     edges: Ints = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     values: Floats = field(default_factory=lambda: np.zeros(0))
 
-    def values_of(self, edges: Ints, other: Floats | float) -> Floats:
-        """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges, or (B, m), then of so many flights."""
+    def values_of(self, edges: Ints, other: Callable[[], Floats | float]) -> Floats:
+        """Values (m,) of edges (m, 2), i < j; for new edges ``other``, (m,) or of so many flights (B, m)."""
         if arrays_equal(edges, self.edges):  # most phases have those of the phase before
-            return np.where(True, self.values, other)
+            return self.values.copy()
         keys, own = _edge_codes(edges), _edge_codes(self.edges)
         order = np.argsort(own)
         at = np.append(order, len(order))[np.searchsorted(own, keys, sorter=order)]
         known = np.append(own, -1)[at] == keys
-        return np.where(known, np.append(self.values, 0.0)[at], other)
+        return np.where(known, np.append(self.values, 0.0)[at], other())
 
     def with_values(self, edges: Ints, values: Floats) -> ByEdge:
         """These values, updated with the ``values`` of edges (m, 2), i < j."""
@@ -148,8 +149,8 @@ def reference_kind(
     """
     if phase.reference != "distances":
         return phase.reference
-    if target is None or not mission.formations[phase.formation].knows_slots:
-        return "squares"
+    if target is None or len(target) < 4 or not mission.formations[phase.formation].knows_slots:
+        return "squares"  # three agents lie in a plane
     edges = mission.formation_edges(phase.formation)
     lengths = mission.formation_distances(phase.formation)
     if not np.allclose(distance_geometry.distances(target, edges), lengths, rtol=1e-3):

@@ -152,7 +152,7 @@ class _Flights:
         law = plan.problem.law._replace(mu=self.mission.damping(None))
         problem = plan.problem._replace(law=law)
         edges = [(int(i), int(j)) for i, j in plan.edges]
-        before = now.reference.values_of(plan.edges, _edge_lengths(self.r, plan.edges))
+        before = now.reference.values_of(plan.edges, lambda: _edge_lengths(self.r, plan.edges))
         sums = [self.integral.get(edge, np.zeros(count)) for edge in edges]
         y = np.column_stack([self.r.reshape(count, -1), self.v.reshape(count, -1), *sums])
         places, options = _flights_with_substitutes(self.finished), self.mission.integrator
@@ -161,7 +161,7 @@ class _Flights:
         ends = batch.fly_all(
             problem,
             y[places],
-            before[places],
+            np.broadcast_to(before, (count, len(edges)))[places],
             (now.t, plan.t_end),
             rtol=options.rtol,
             atol=absolute_tolerances(options, y.shape[1], velocity, plan.distances, large=False),

@@ -29,15 +29,15 @@ class Sampling:
         if self.times is not None:
             begin = 0 if first and t == 0.0 else self.times.searchsorted(t, "right")
             return self.times[begin : self.times.searchsorted(t_end, "right")]
-        step = self.step
+        step, same = self.step, 1e-9 * self.step  # but for rounding
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.minimum(np.arange(low, high) * step, t_end)
         losses = (*plan.lost_at.tolist(), *plan.links_lost[1].tolist()) if plan.loses else ()
         passed = (at["time"] for at in plan.through)
         for exact in dict.fromkeys((plan.arrival, plan.t_end, stop, *passed, *losses)):
             if t < exact <= t_end:
-                others = grid[np.abs(grid - exact) > 1e-9 * step]  # not the same but for rounding
-                grid = np.sort(np.append(others, exact))
+                a, b = grid.searchsorted(exact - same), grid.searchsorted(exact + same, "right")
+                grid = np.concatenate([grid[:a], (exact,), grid[b:]])
         if not first:
             return grid
         start = t if t == 0.0 else math.nextafter(t, math.inf)

@@ -21,6 +21,7 @@ from pydantic import Field, Strict
 
 from rigidfleet._common.arguments import as_path
 from rigidfleet._common.renamed import rename_hint, with_earlier_members
+from rigidfleet._common.toml import to_toml_data
 from rigidfleet._version import __version__
 from rigidfleet.errors import MissionError, RigidfleetError, SweepError, wrong_type
 from rigidfleet.mission import Mission, load_mission, mission_names
@@ -135,7 +136,7 @@ class Sweep:
     ) -> None:
         self.mission, self.variations, self.header = mission, tuple(variations), header
         self.seed, self.name, self.evaluate = header.seed, name, header.evaluate
-        self.drill = header.drill
+        self.drill, self._validated = header.drill, {}
         trials = self.drill.trials if self.drill else 1
         self.runs = header.runs or trials * math.prod(self.grid_sizes.values())
         if self.runs > _RUNS:
@@ -275,9 +276,9 @@ class Sweep:
         tables = (*_SEEDED[:3], ("avoidance", "sensing_noise"))
         return any(look_up(self.document_of_run(0), keys) for keys in tables)
 
-    @property
+    @cached_property
     def mission_document(self) -> dict[str, Any]:
-        """The mission as plain data, as written."""
+        """The mission as plain data, as written; the runs share what does not vary."""
         return self.mission.to_dict()
 
     @cached_property
@@ -315,15 +316,17 @@ class Sweep:
         ]
 
     def document_of_run(
-        self, run: int, values: Sequence[Any] | None = None, mission: Mission | None = None
+        self, run: int, values: Sequence[Any] | None = None, whole: dict[str, Any] | None = None
     ) -> dict[str, Any]:
-        """The mission of a run as plain data, not yet checked.
+        """The mission of a run as plain data, not yet checked; it shares what does not vary.
 
-        ``values`` are those of the run, if they are known; ``mission`` is that of the sweep with its ways, if it has
-        some.
+        ``values`` are those of the run, if they are known; ``whole`` is the mission of the sweep with its ways, if not
+        as written.
         """
-        varied = {column.keys for column in self.columns}
-        document, values = (mission or self.mission).to_dict(), values or self.values(run)
+        varied, values = {column.keys for column in self.columns}, values or self.values(run)
+        document = {**(whole or self.mission_document)}
+        for name in document.keys() & {keys[0] for keys in (*varied, *_SEEDED)}:
+            document[name] = to_toml_data(document[name])
         if self.drill:
             stream = faults.random_stream(self.seed, run, 2)
             faults.apply_fault(document, *values[:2], stream, self.mission.n_agents, self._end_time)
@@ -346,14 +349,13 @@ class Sweep:
         MissionError
             It has errors.
         """
-        if self._mission_with_ways is not self.mission:
-            with suppress(MissionError):  # errors are told of the mission as written
-                document = self.document_of_run(run, values, self._mission_with_ways)
-                return Mission.from_plain(document, f"run {run}")
+        with suppress(MissionError):  # errors are told of the mission as written
+            document = self.document_of_run(run, values, self._document_with_ways)
+            return Mission.from_plain(document, f"run {run}", validated=self._validated)
         return Mission.from_plain(self.document_of_run(run, values), f"run {run}")
 
     @cached_property
-    def _mission_with_ways(self) -> Mission:
+    def _document_with_ways(self) -> dict[str, Any]:
         """The mission with phases for its transitions and ways if nothing that varies matters to them, else as written.
 
         Then they are searched once for all runs. The start is such a key, too.
@@ -361,10 +363,10 @@ class Sweep:
         from rigidfleet.planning.timing import can_affect_plan, expand_mission
 
         if any(can_affect_plan(self.mission, column.keys) for column in self.columns):
-            return self.mission
+            return self.mission_document
         with suppress(MissionError):  # without a way, each run says so
-            return expand_mission(self.mission)
-        return self.mission
+            return expand_mission(self.mission).to_dict()
+        return self.mission_document
 
     @cached_property
     def _end_time(self) -> float:
