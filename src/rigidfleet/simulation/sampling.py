@@ -36,8 +36,9 @@ class Sampling:
         passed = (at["time"] for at in plan.through)
         for exact in dict.fromkeys((plan.arrival, plan.t_end, stop, *passed, *losses)):
             if t < exact <= t_end:
-                others = grid[np.abs(grid - exact) > 1e-9 * step]  # not the same but for rounding
-                grid = np.sort(np.append(others, exact))
+                # In the place of those that differ from it by rounding alone.
+                same = grid.searchsorted([exact - 1e-9 * step, exact + 1e-9 * step])
+                grid = np.concatenate([grid[: same[0]], (exact,), grid[same[1] :]])
         if not first:
             return grid
         start = t if t == 0.0 else math.nextafter(t, math.inf)
