@@ -1,5 +1,6 @@
 """Whole flights: phases and switches, the paper's missions, their failures, users' own forces."""
 
+import copy
 import re
 import time
 from functools import cache
@@ -1214,6 +1215,27 @@ def test_a_result_knows_the_mission_that_was_flown():
     """Not one read again: what has been made of it once, edges and slots assigned, serves the verdict, too."""
     mission = load_mission("establish-triangle")
     assert simulate(mission).mission is mission
+
+
+@pytest.mark.parametrize(
+    "name", ["narrow-passage", "windy-passage", "establish-cube", "passage-quadrotors"]
+)
+def test_flights_of_one_mission_do_not_disturb_each_other(name):
+    """One after the other, in turns or of a deep copy, they are the same to the last bit: all memory is their own."""
+    mission = load_mission(name)
+    every = [simulate(mission)]
+    turns = [Flight(m) for m in (copy.deepcopy(mission), mission, mission)]
+    while any([flight.begin() for flight in turns]):
+        going = turns
+        while going:
+            going = [flight for flight in going if flight.advance(40.0)]
+    every += [flight.finish() for flight in turns] + [simulate(mission)]
+    for result in every[1:4]:
+        for key in ("position", "velocity", "multiplier", "slot_position"):
+            np.testing.assert_array_equal(getattr(result, key), getattr(every[1], key))
+    for key in ("position", "velocity", "multiplier", "slot_position"):
+        np.testing.assert_array_equal(getattr(every[4], key), getattr(every[0], key))
+    assert [p.extremes for p in every[4].phases] == [p.extremes for p in every[0].phases]
 
 
 @pytest.mark.parametrize("kind", ["hold", "reshape"])

@@ -5,7 +5,7 @@ compiled with the extents that types of arrays declare here as numbers (see `com
 """
 
 import math
-from functools import cache
+from functools import cache, lru_cache
 from itertools import accumulate
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
@@ -278,17 +278,24 @@ def workspace(
     """
     size = 0 if large else min(m, 3 * n) if solver == ITERATED else m
     vectors = 0 if large or solver in (ITERATED, EXACT) else m
-    sizes: dict[Any, int] = {"N": n, "m": m, "A": size, "V": vectors, "H": 3 * n if with_h else 0}
-    shapes = [
-        tuple(x if isinstance(x, int) else sizes[x] for x in extents)
-        for extents in extents_of(Workspace).values()
-    ]
-    # Side by side in one memory, each aligned to a cache line.
-    *starts, length = accumulate((padded(math.prod(shape)) for shape in shapes), initial=0)
-    places, memory = zip(starts, shapes, strict=True), zeros(length)
-    w = Workspace(*[memory[k : k + math.prod(shape)].reshape(shape) for k, shape in places])
+    layout = _workspace_layout(n, m, size, vectors, 3 * n if with_h else 0)
+    memory = np.ndarray((), layout, zeros(layout.itemsize // 8))
+    w = Workspace(*[memory[name] for name in Workspace._fields])
     w.T[:] = w.T_ref[:] = np.eye(3)
     return w
+
+
+@lru_cache
+def _workspace_layout(*sizes: int) -> np.dtype[Any]:
+    """Arrays of extents N, m, A, V and H side by side in one memory, each aligned to a cache line."""
+    size_of: dict[Any, int] = dict(zip("NmAVH", sizes, strict=True))
+    shapes = [
+        tuple(x if isinstance(x, int) else size_of[x] for x in extents)
+        for extents in extents_of(Workspace).values()
+    ]
+    *starts, _ = accumulate((8 * padded(math.prod(shape)) for shape in shapes), initial=0)
+    kinds = [(float, shape) for shape in shapes]
+    return np.dtype({"names": Workspace._fields, "formats": kinds, "offsets": starts})
 
 
 def padded(count: int) -> int:

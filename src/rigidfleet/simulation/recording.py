@@ -190,6 +190,7 @@ def assemble_result(
     been evaluated at the samples.
     """
     pieces = [p for p in pieces if len(p.time)]
+    counts = [len(p.time) for p in pieces]
     time = np.concatenate([p.time for p in pieces])
     flown = _vehicle_samples(pieces)
     tau = flown.tau if flown is not None and flown.tau.size else None
@@ -204,17 +205,17 @@ def assemble_result(
     states = [p.source.motion for p in pieces if isinstance(p.source, Unevaluated)]
     later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = []
     if len(states) == len(pieces):
-        r, v = (np.concatenate(parts) for parts in zip(*states, strict=True))
-        now = {"position": r.copy(), "velocity": v}  # what is computed later is of what was flown
+        r, v = zip(*states, strict=True)
+        now = {"position": np.concatenate(r), "velocity": np.concatenate(v)}
         later = [(names, recorded), (CLOSE, partial(closeness_arrays, mission, worst, r, time))]
     else:
         made = recorded()
-        r, now = made["position"], {name: made[name] for name in (*_STATES, *names)}
+        now = {name: made[name] for name in (*_STATES, *names)}
+        r = np.split(now["position"], np.cumsum(counts)[:-1])
         now |= closeness_arrays(mission, worst, r, time)
-    counts = [len(p.time) for p in pieces]
     later += [
         (LATER, partial(_slot_references, mission, [(p.time, p.followed) for p in pieces], tau)),
-        (("singular_value",), partial(_singular_values, r, counts, [p.edges for p in pieces])),
+        (("singular_value",), partial(_singular_values, r, [p.edges for p in pieces])),
         (("mission_text",), partial(mission_text_field, mission)),
     ]
     return Result(
@@ -311,17 +312,18 @@ def _flying_mask(mission: Mission, time: Floats) -> Bools | None:
 def closeness_arrays(
     mission: Mission,
     worst: Sequence[dict[str, Extremum]],
-    r: Floats,
+    places: Sequence[Floats],
     time: Floats,
     left: Bools | None = None,
 ) -> dict[str, Any]:
-    """Distances at samples r (K, N, 3); the one after an extreme of a phase, ``worst``, has the extreme.
+    """Distances at places (K, N, 3) of each piece; the one after an extreme of a phase, ``worst``, has the extreme.
 
     Vehicles count that are not lost, or those ``left`` (K, N).
     """
     left = _flying_mask(mission, time) if left is None else left
     if left is None:
         left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
+    r = np.concatenate(places)
     close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
     _lower_closeness(worst, time, close)
     arrays = close.separation, close.pair, close.clearance, close.agent, close.obstacle
@@ -482,17 +484,17 @@ def _edge_columns(some: Ints, edges: Ints) -> Ints | slice:
     return order[np.searchsorted(keys[order], some[:, 0] * key + some[:, 1])]
 
 
-def _singular_values(r: Floats, counts: Sequence[int], edges: Sequence[Ints]) -> dict[str, Floats]:
+def _singular_values(places: Sequence[Floats], edges: Sequence[Ints]) -> dict[str, Floats]:
     """Smallest non-zero singular value of J (K,); NaN if the formation is too large to compute it.
 
-    ``counts`` and ``edges`` are those of each piece. In formations of some tens of agents it is computed at some
-    samples of each piece, and linear in between.
+    ``places`` (K, N, 3) and ``edges`` are those of each piece. In formations of some tens of agents it is computed at
+    some samples of each piece, and linear in between.
     """
     # Pieces with the same edges at once, if that is not too much.
-    whole = all(arrays_equal(some, edges[0]) for some in edges)
-    whole = whole and len(r) * min(len(edges[0]), 3 * r.shape[1]) ** 3 <= _WORK
-    parts = [r] if whole else np.split(r, np.cumsum(counts)[:-1])
-    values = [_smallest_singular_values(*each) for each in zip(parts, edges, strict=False)]
+    size, count = min(len(edges[0]), 3 * places[0].shape[1]), sum(map(len, places))
+    if all(arrays_equal(some, edges[0]) for some in edges) and count * size**3 <= _WORK:
+        places = [np.concatenate(places)]
+    values = [_smallest_singular_values(*each) for each in zip(places, edges, strict=False)]
     return {"singular_value": np.concatenate(values)}
 
 

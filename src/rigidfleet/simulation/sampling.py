@@ -36,6 +36,7 @@ class Sampling:
         passed = (at["time"] for at in plan.through)
         for exact in dict.fromkeys((plan.arrival, plan.t_end, stop, *passed, *losses)):
             if t < exact <= t_end:
+                # In the place of those that differ from it by rounding alone.
                 a, b = grid.searchsorted(exact - same), grid.searchsorted(exact + same, "right")
                 grid = np.concatenate([grid[:a], (exact,), grid[b:]])
         if not first:

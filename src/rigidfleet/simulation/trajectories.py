@@ -516,7 +516,7 @@ def result_of(
         **known, **unknown, **dict.fromkeys(CLOSE), phases=records, mission_text="",
         statistics=statistics, **ending,
         later=[
-            (CLOSE, partial(closeness_arrays, mission, worst, r, time, left)),
+            (CLOSE, partial(closeness_arrays, mission, worst, [r], time, left)),
             (("mission_text",), partial(mission_text_field, mission)),
         ],
     )  # fmt: skip
