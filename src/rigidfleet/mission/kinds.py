@@ -155,6 +155,11 @@ class AnyPhase(Part):
         return [key for key in TIMES if self.__dict__.get(key) == AUTO]
 
     @property
+    def has_least_time(self) -> bool:
+        """Whether `duration = "auto"` may end the phase: it moves, or takes a formation, and then is done."""
+        return self.moves or self.shapes
+
+    @property
     def time_key(self) -> str:
         """The key that sets the time of its motion."""
         own = self.__dict__
@@ -575,6 +580,7 @@ def _duration_of(trajectories: Any) -> float:
 class Orbit(Cruising):
     """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
 
+    has_least_time: ClassVar[bool] = False
     kind: Literal["orbit"] = required_key("circle a point")
     centre: values.Vector = required_key("centre of the horizontal circle [x, y, z] [m]")
     radius: values.Length = required_key("radius of the circle [m]")

@@ -175,7 +175,7 @@ def _motion_time_rules(m: Draft, p: Phase, k: int, duration: float | None) -> Br
         yield from unused_key_rules(p, "blend", "reference", "shape")
     elif duration is None or p.follows_curves or not lasts > duration * (1 + 1e-9):
         return
-    elif hasattr(p, "blend"):
+    elif p.time_key == "blend":
         problem = f"is longer than the phase, which lasts {duration:g} s"
         yield Breach("blend", problem, f"use blend <= {duration:g} or end the phase later", lasts)
     else:
@@ -536,11 +536,10 @@ def _automatic_time_rules(m: Draft, p: Phase, k: int) -> Breaches:
     if p.control != "tracking":
         problem = f"needs tracked slots to have a least time, not control '{p.control}'"
         yield Breach(keys[0], problem, "use control = 'tracking', or give a time")
-    timed = p.steering or p.shaping or p.vertical or p.follows_curves or p.replaced
-    if p.duration == AUTO and not timed:
+    if p.duration == AUTO and not p.has_least_time:
         problem = f"a phase of kind '{p.kind}' has no least duration"
         yield Breach("duration", problem, "give a duration")
-    if p.duration == AUTO and timed and getattr(p, "travel", None) is not None:
+    if p.duration == AUTO and p.time_key == "travel":
         problem = "has no effect with duration = 'auto', which ends the phase at the arrival"
         yield Breach("travel", problem, "remove one of them")
     limits = m.limits
