@@ -13,7 +13,7 @@ from rigidfleet.foreign.curves import rows_to_curve
 from rigidfleet.math.piecewise import Piecewise, stack_ways
 from rigidfleet.mission import values
 from rigidfleet.mission.values import AUTO, Part, key, models_by_kind, required_key
-from rigidfleet.typing import Ints
+from rigidfleet.typing import InputLaw, Ints
 
 #: Keys of a phase that may be automatic, and the word for it.
 TIMES = ("duration", "travel", "blend")
@@ -69,7 +69,7 @@ class AnyPhase(Part):
         "the phase ends after this time [s]; auto: as soon as the limits allow (smooth missions)"
     )
     settle: Settle | None = key("the phase ends when its error has settled")
-    control: Literal["open", "tracking", "body"] = key(
+    control: InputLaw = key(
         "open: weight compensation and input_force; tracking: each agent tracks its slot; body: "
         "wrench on the virtual body. With architecture 'body' the default is open for establish, tracking for "
         "orbit and body for other phases",
@@ -79,6 +79,16 @@ class AnyPhase(Part):
         "force on each agent in addition to weight compensation [N]; only with control 'open'",
         (0.0, 0.0, 0.0),
     )
+
+    @property
+    def tracks_slots(self) -> bool:
+        """Whether each agent tracks its slot."""
+        return self.control == "tracking"
+
+    @property
+    def leads_body(self) -> bool:
+        """Whether feedback leads the virtual body, by a wrench that agents share."""
+        return self.control == "body"
 
     @property
     def shaping(self) -> "Shaping | None":

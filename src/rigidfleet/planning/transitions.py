@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -65,9 +65,8 @@ def expand_phases(mission: Mission, timed: Timed) -> Mission:
         if not phase.flown_as_written:
             so_far = data | {"phases": tables, "formations": data["formations"] | forms}
             state = partial(_state_after, mission, so_far, timed)
-            expand: Callable[..., _Parts]
             expand = _expand_transition if phase.vertical is None else _expand_stagger
-            parts, levels = expand(mission, k, table, phase, before, state)
+            parts, levels = expand(mission, k, table, cast(Any, phase), before, state)
             forms |= levels
         tables += parts
         before = before if phase.shaping is None else phase.shaping.formation
