@@ -5,8 +5,9 @@ import pytest
 from scipy.signal import impulse, lsim
 
 from rigidfleet.assessment import assess
+from rigidfleet.errors import MissionError
 from rigidfleet.math.margins import Lag, LoopGains, tracking_lag_time
-from rigidfleet.mission import Mission
+from rigidfleet.mission import KINDS, Mission
 from rigidfleet.mission.vehicles import MODELS
 from rigidfleet.planning.vehicles import tracking_lag_times
 from rigidfleet.preflight.check import check
@@ -127,6 +128,32 @@ def beyond(mission):
     names = ("speed", "acceleration", "tilt", "thrust")
     verdict = assess(simulate(mission))
     return [c.message for c in verdict.checks if c.check.endswith(names) and not c.passed]
+
+
+def test_a_brake_takes_its_least_time():
+    """From a steady flight, the velocity falls as a quintic, whose greatest slope is 15/8 of its mean."""
+    away = FLY | {"position": [9, 0, 6], "velocity": [2, 0, 0]}
+    mission = points(FLY, TAKE | BOTH, away, {"kind": "brake"} | AUTO)
+    result = simulate(mission)
+    assert assess(result).passed
+    brake = result.phases[-1]
+    assert brake.t_end - brake.t_start == pytest.approx(15 / 8 * 2 / 2, rel=0.01)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_that_can_be_done_has_a_least_time(kind):
+    """An automatic duration is refused of kinds that are never done, to hold and to orbit, and of no other."""
+    needs = {
+        "establish": TAKE, "reshape": {"formation": "wide"}, "fly": FLY, "go": FLY, "turn": {"yaw_deg": 9.0},
+        "takeoff": {"height": 6}, "follow": {"file": "a.csv"},
+        "orbit": {"centre": [4, 0, 6], "radius": 4, "rate_deg_s": 12},
+    }  # fmt: skip
+    refused = ""
+    try:
+        points(TAKE | BOTH, needs.get(kind, {}) | {"kind": kind} | AUTO)
+    except MissionError as error:
+        refused = str(error)
+    assert ("has no least duration" in refused) == (kind in ("hold", "orbit"))
 
 
 @pytest.mark.parametrize("model", MODELS)

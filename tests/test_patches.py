@@ -5,6 +5,7 @@ applied to a copy of the package and its documents, and the script runs there, i
 a patch no longer applies, make the change by hand and write it again: `git diff -U1 > tests/patches/NAME.patch`.
 """
 
+import ast
 import os
 import re
 import shutil
@@ -18,8 +19,8 @@ ROOT = Path(__file__).parents[1]
 PATCHES = ROOT / "tests" / "patches"
 #: Most files of `src` that each task may touch.
 TASKS = {
-    "add_a_kind_of_phase": 3, "add_a_limit": 2, "change_a_message_everywhere": 1, "find_eq_12": 0,
-    "say_why_a_flight_failed": 0,
+    "add_a_controller": 4, "add_a_kind_of_phase": 3, "add_a_limit": 2, "change_a_message_everywhere": 1,
+    "find_eq_12": 0, "say_why_a_flight_failed": 0,
 }  # fmt: skip
 
 
@@ -28,7 +29,11 @@ def test_each_task_is_counted():
     assert {path.stem for path in PATCHES.iterdir() if path.suffix in (".py", ".patch")} == {*TASKS}
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    "task",
+    # A law is compiled with all that calls it.
+    [pytest.param(x, marks=pytest.mark.long if x == "add_a_controller" else ()) for x in TASKS],
+)
 def test_a_task_touches_few_files_and_works(task, tmp_path):
     """The patch of a task touches no more files of the package than it may, applies, and passes its script."""
     for name in ("src", "docs"):
@@ -48,3 +53,19 @@ def test_a_task_touches_few_files_and_works(task, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout == "done\n"
+
+
+def test_the_recipe_of_a_controller_names_who_tells_laws_apart():
+    """Only the files that CONTRIBUTING names compare the law of a phase with one that has feedback."""
+    tells = set()
+    for path in (ROOT / "src" / "rigidfleet").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Compare):
+                text = ast.unparse(node)
+                law = re.search(r"\b(TRACKING|BODY)\b|'(tracking|body)'", text)
+                if law and re.search(r"\bcontrols?\b", text):
+                    tells.add(path.relative_to(ROOT / "src" / "rigidfleet").as_posix())
+    recipe = (ROOT / "CONTRIBUTING.md").read_text().partition("## Add a controller")[2]
+    assert "kernel/control.py" in tells
+    assert tells <= {*re.findall(r"`([\w/]+\.py)`", recipe)}
+    assert len(tells) <= 7

@@ -109,7 +109,7 @@ def open_problem(vehicles: fleet.Quadrotors) -> Problem:
     return packing.example_of(Problem)._replace(
         vehicles=Vehicles(m, 1 / m, m.sum(), m.mean(), np.full(n, np.inf), False, vehicles.g),
         graph=graph(np.zeros((0, 2), dtype=np.int64), m),
-        control=Control(OPEN, np.zeros((n, 3)), 0.0, 0.0, RIGID),
+        control=Control(OPEN, False, False, np.zeros((n, 3)), 0.0, 0.0, RIGID),
         disturbance=no_disturbance(m),
     )
 

@@ -52,6 +52,14 @@ np.testing.assert_allclose(
     result.position[some, :, 2], result.position[some][0, :, 2] + rise[some, None], atol=1e-6
 )
 
+# With a time that follows from the limits: a septic from rest to rest is fastest half way, 35/16 of its mean speed
+timed = mission.to_dict()
+timed["phases"][1] |= {"travel": None, "duration": "auto"}
+hurry = rf.simulate(Mission.from_dict(timed))
+assert rf.assess(hurry).passed
+length = hurry.phases[1].t_end - hurry.phases[1].t_start
+np.testing.assert_allclose(length, 35.0 / 16.0 * 6.0 / 2.0, rtol=0.01)
+
 # Recorded, exported and shown
 out = Path("out")
 out.mkdir()

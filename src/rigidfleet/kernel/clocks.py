@@ -24,7 +24,6 @@ from rigidfleet.kernel.clock_records import (
 )
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.mail import CLOCK
-from rigidfleet.kernel.problem import TRACKING
 
 #: Bandwidth of the pace [1/s]: two equal lags, so that the acceleration of a reference does not jump.
 _BANDWIDTH = 5.0
@@ -123,7 +122,7 @@ def apply_own_clock(i, k, t, p, w, flight, state):
     """
     net, mail, own, g = flight.network, state.mail, state.tau[i], p.vehicles.g
     rate, slope, tick = own[RATE], own[SLOPE], flight.steps * flight.h
-    tracks = p.control.kind == TRACKING
+    tracks = p.control.tracks_slots
     early, error = min(t + own[OFF] - p.motion.knots[0], 0.0), 0.0
     for l in range(net.first[i] - 1, net.first[i + 1]):
         j, ahead, pace = i, early, rate
@@ -164,7 +163,7 @@ def apply_own_clock(i, k, t, p, w, flight, state):
 @jit
 def write_slots_by_own_clock(p, w, state):
     """Put into w the slot of each vehicle by its own clock: what others know of it is no longer needed."""
-    for i in range(state.tau.shape[0] if p.control.kind == TRACKING else 0):
+    for i in range(state.tau.shape[0] if p.control.tracks_slots else 0):
         for q in range(3):
             w.r_ref[i, q], w.v_ref[i, q] = state.tau[i, SLOT + q], state.tau[i, SLOT + 3 + q]
             w.a_ref[i, q] = state.tau[i, SLOT + 6 + q]

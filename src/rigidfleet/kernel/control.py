@@ -242,9 +242,9 @@ def input_law(t, p, w):
     Also computes the mean axes (w.cm, w.I), if they are needed, and the slots (w.p).
     """
     m, M, control = p.vehicles.m, p.vehicles.M, p.control
-    if p.law.k_def > 0.0 or p.has_frame or control.kind == BODY:
+    if p.law.k_def > 0.0 or p.has_frame or control.leads_body:
         mean_axes(w.r, w.v, m, M, w)
-    if p.reference.kind == SHAPE or control.kind == TRACKING:
+    if p.reference.kind == SHAPE or control.tracks_slots:
         blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
     if control.kind == TRACKING:
         local_law(t, p, w)

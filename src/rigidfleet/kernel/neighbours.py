@@ -32,7 +32,7 @@ from rigidfleet.kernel.mail import (
     U,
     V,
 )
-from rigidfleet.kernel.problem import ITERATED, TRACKING
+from rigidfleet.kernel.problem import ITERATED
 
 # Columns of `Mail.rows`: unit vector, right side, multiplier, link.
 _UNIT, _RIGHT, _UNKNOWN, _LINK = 0, 3, 4, 5
@@ -104,7 +104,7 @@ def write_equation_of_edge(row, link, k, dt, tick, p, w, net, mail, saturated):
     rows, heard, own, law = mail.rows, mail.heard[link], mail.own[link], p.law
     age = (k - mail.stamp[link]) * tick
     mail.oldest[link] = max(mail.oldest[link], k - mail.stamp[link])
-    tracks = p.control.kind == TRACKING
+    tracks = p.control.tracks_slots
     distance = along = square = pull = 0.0
     x, k1, k2 = rows[row, _UNIT:_RIGHT], p.control.k1, p.control.k2
     for q in range(3):

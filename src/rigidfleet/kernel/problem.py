@@ -47,7 +47,8 @@ CONSTANT, SQUARED, SHAPE = range(3)
 OPEN, TRACKING, BODY = range(3)
 # Allocation of a wrench (`Control.allocation`), the last three with the paper's H.
 RIGID, PINV_EQUAL, PINV_INERTIA, PINV_INERTIA_FORCE = range(4)
-#: Their names in missions: solvers, and splits of the torque.
+#: Their names in missions: input laws, solvers, and splits of the torque.
+LAWS = {"open": OPEN, "tracking": TRACKING, "body": BODY}
 SOLVERS = {"iterated": ITERATED, "spectral": SPECTRAL, "exact": EXACT, "pinv": PINV}
 SPLITS = {"equal": PINV_EQUAL, "inertia": PINV_INERTIA, "inertia+force": PINV_INERTIA_FORCE}
 
@@ -154,9 +155,11 @@ NO_FEEDBACK = Feedback(
 
 
 class Control(NamedTuple):
-    """Input law of a phase."""
+    """Input law of a phase. Other code asks what it does, not which it is."""
 
     kind: int
+    tracks_slots: bool  # each agent tracks its slot: the law calls `control.desired_agents`
+    leads_body: bool  # feedback leads the virtual body, from its mean axes to a wrench
     force: Places  # open loop: input force, weight balance included [N]
     k1: float  # local LQR [1/s^2]
     k2: float  # [1/s]

@@ -6,7 +6,7 @@ from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.constraint import find_multipliers
 from rigidfleet.kernel.dynamics import closed_loop
 from rigidfleet.kernel.linalg import copy, copy_vector
-from rigidfleet.kernel.problem import BODY, OPEN, TRACKING
+from rigidfleet.kernel.problem import OPEN
 from rigidfleet.kernel.references import blend_slots
 
 
@@ -25,7 +25,6 @@ def write_record(times, samples, p, w, scratch, out, first):
 @jit
 def record_sample(t, p, w, k, out):
     """Copy the values of the closed loop at time t [s] from the workspace into row k of a record; NaN for none."""
-    kind = p.control.kind
     find_multipliers(p.graph)
     for i in range(w.c.shape[0]):
         out.c[k, i], out.L[k, i], out.multiplier[k, i] = w.c[i], w.L[i], w.multiplier[i]
@@ -50,18 +49,18 @@ def record_sample(t, p, w, k, out):
     # Even if only distances are blended, the slots give the formation's attitude.
     blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
     copy(w.p, out.p[k])
-    if kind == OPEN:
+    if p.control.kind == OPEN:
         out.T_ref[k] = math.nan
     else:
         copy(w.T_ref, out.T_ref[k])
-    if kind == TRACKING:
+    if p.control.tracks_slots:
         copy(w.r_ref, out.r_ref[k])
         for q in range(3):
             out.motion[k, q], out.motion[k, 3 + q] = w.body[0, q], w.body[1, q]
             out.rates[k, q] = w.body[3, q]
         return
     out.r_ref[k] = out.motion[k] = out.rates[k] = math.nan
-    if kind == BODY:
+    if p.control.leads_body:
         since = t - p.feedback.arrival
         for q in range(3):
             out.motion[k, q] = p.feedback.r[q] + p.feedback.v[q] * since

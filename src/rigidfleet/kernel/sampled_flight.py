@@ -51,7 +51,7 @@ from rigidfleet.kernel.neighbours import (
     solve_own_constraint_force,
 )
 from rigidfleet.kernel.network import receive, send
-from rigidfleet.kernel.problem import SHAPE, TRACKING
+from rigidfleet.kernel.problem import SHAPE
 from rigidfleet.kernel.quadrotor import normalise_quaternion, runge_kutta
 from rigidfleet.kernel.records import ASKS, COLLAPSED, FINISHED, PAUSED
 from rigidfleet.kernel.references import blend_slots, distance_references
@@ -173,7 +173,7 @@ def write_desired_force(k, i, dt, p, w, flight, state):
         pull += w.f_C[i, q] * w.f_C[i, q]
     if not vehicles.lost[i]:
         record_if_worse(i, CONSTRAINT_FORCE, math.sqrt(pull), state.work.law_time[0], state)
-    if p.control.kind == TRACKING:
+    if p.control.tracks_slots:
         if guidance.drag[i] > 0.0 and not own:
             compensate_drag(i, w.v_ref[i], guidance.drag[i], vehicles, state)
         for q in range(0 if own else 3):
@@ -244,9 +244,9 @@ def evaluate_distributed_law(k, t, dt, p, w, flight, state):
 @jit
 def evaluate_plan(t, p, w):
     """Slots, input forces and desired distances of the plan at t [s], into w, for the states in w."""
-    if p.reference.kind == SHAPE or p.control.kind == TRACKING:
+    if p.reference.kind == SHAPE or p.control.tracks_slots:
         blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
-    if p.control.kind == TRACKING:
+    if p.control.tracks_slots:
         local_law(t, p, w)
     else:
         copy(p.control.force, w.f_u)
@@ -277,7 +277,7 @@ def prepare_messages(k, p, w, flight, state):
             message[U + q] = m * state.f_u[i, q]
             message[SLOT + q], message[SLOT + 3 + q] = w.r_ref[i, q], w.v_ref[i, q]
             message[SLOT + 6 + q] = w.a_ref[i, q]
-        message[TRACKED] = 1.0 if p.control.kind == TRACKING else 0.0
+        message[TRACKED] = 1.0 if p.control.tracks_slots else 0.0
         message[SATURATED] = 1.0 if state.saturated[i] else 0.0
         post_clock(k, i, flight.clocks, state.tau[i], message)
         for q in range(mail.pull.shape[1]):
@@ -291,7 +291,7 @@ def is_well_predicted(j, k, p, w, flight, mail):
     net, since, square = flight.network, k - mail.said[j], 0.0
     if net.event == 0.0 or mail.said[j] == NONE or since >= net.longest:
         return False
-    age, tracks = since * flight.steps * flight.h, p.control.kind == TRACKING
+    age, tracks = since * flight.steps * flight.h, p.control.tracks_slots
     for q in range(3):
         place, _, _ = extrapolate_neighbour(j, q, age, mail.last[j], tracks, w, 0.0, 0.0)
         square += (w.r[j, q] - place) ** 2

@@ -21,7 +21,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from rigidfleet.math import pid
 from rigidfleet.math.constraint_jacobian import filter_factors, jacobian
 from rigidfleet.math.rigid_body import rigid_motions
-from rigidfleet.typing import Bools, Floats, Ints
+from rigidfleet.typing import Bools, Floats, InputLaw, Ints
 
 Complexes = NDArray[np.complexfloating]
 
@@ -114,7 +114,7 @@ class LoopGains:
     k1: float = 2.0
     k2: float = 8.0**0.5
     ki: float = 0.0
-    control: Literal["tracking", "body", "open"] = "tracking"
+    control: InputLaw = "tracking"
     k_def: float = 1.0
     solver: str = "iterated"
     damping: float = 0.03

@@ -13,7 +13,7 @@ from rigidfleet.foreign.curves import rows_to_curve
 from rigidfleet.math.piecewise import Piecewise, stack_ways
 from rigidfleet.mission import values
 from rigidfleet.mission.values import AUTO, Part, key, models_by_kind, required_key
-from rigidfleet.typing import Ints
+from rigidfleet.typing import InputLaw, Ints
 
 #: Keys of a phase that may be automatic, and the word for it.
 TIMES = ("duration", "travel", "blend")
@@ -69,7 +69,7 @@ class AnyPhase(Part):
         "the phase ends after this time [s]; auto: as soon as the limits allow (smooth missions)"
     )
     settle: Settle | None = key("the phase ends when its error has settled")
-    control: Literal["open", "tracking", "body"] = key(
+    control: InputLaw = key(
         "open: weight compensation and input_force; tracking: each agent tracks its slot; body: "
         "wrench on the virtual body. With architecture 'body' the default is open for establish, tracking for "
         "orbit and body for other phases",
@@ -79,6 +79,16 @@ class AnyPhase(Part):
         "force on each agent in addition to weight compensation [N]; only with control 'open'",
         (0.0, 0.0, 0.0),
     )
+
+    @property
+    def tracks_slots(self) -> bool:
+        """Whether each agent tracks its slot."""
+        return self.control == "tracking"
+
+    @property
+    def leads_body(self) -> bool:
+        """Whether feedback leads the virtual body, by a wrench that agents share."""
+        return self.control == "body"
 
     @property
     def shaping(self) -> "Shaping | None":
@@ -153,6 +163,11 @@ class AnyPhase(Part):
     def auto_keys(self) -> list[str]:
         """Keys whose times follow from the limits (`rigidfleet.planning.timing`)."""
         return [key for key in TIMES if self.__dict__.get(key) == AUTO]
+
+    @property
+    def has_least_time(self) -> bool:
+        """Whether `duration = "auto"` may end the phase: it moves, or takes a formation, and then is done."""
+        return self.moves or self.shapes
 
     @property
     def time_key(self) -> str:
@@ -575,6 +590,7 @@ def _duration_of(trajectories: Any) -> float:
 class Orbit(Cruising):
     """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
 
+    has_least_time: ClassVar[bool] = False
     kind: Literal["orbit"] = required_key("circle a point")
     centre: values.Vector = required_key("centre of the horizontal circle [x, y, z] [m]")
     radius: values.Length = required_key("radius of the circle [m]")

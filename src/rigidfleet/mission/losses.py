@@ -83,7 +83,7 @@ def _abort_rules(m: Draft) -> Breaches:
 def _required_tracking_rules(m: Draft, when: float, what: str, does: str, other: str) -> Breaches:
     """Slots are tracked in what may be under way at a loss or abort at a time [s]; words of it, and another remedy."""
     for k, p in phases_under_way(m.phases, when):
-        if p.control != "tracking":
+        if not p.tracks_slots:
             problem = (
                 f"may be under way at the {what} at {when:g} s, but only tracked slots can {does}"
             )

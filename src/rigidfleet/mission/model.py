@@ -331,7 +331,7 @@ class Mission(Contents, Shown):
             axes: Floats | None = np.eye(3)  # axes of this formation in those of the one before
             if self.leaves_attitude_free(p):
                 axes = lies = None
-                commanded = None if p.control == "tracking" else commanded
+                commanded = None if p.tracks_slots else commanded
             elif (establishing := p.establishing) is not None:
                 commanded = self.establish_attitude(establishing, commanded)
                 axes = None if lies is None else lies @ commanded.T
@@ -384,8 +384,8 @@ class Mission(Contents, Shown):
         its formation is given by distances alone, which have no axes.
         """
         taken = phase.establishing
-        if phase.control != "tracking" or taken is None:
-            return phase.control != "tracking"
+        if not phase.tracks_slots or taken is None:
+            return not phase.tracks_slots
         if taken.attitude_deg is not None:
             return False
         return taken.attitude == "free" or not self.formations[taken.formation].knows_slots

@@ -40,7 +40,7 @@ def network_rules(m: Draft) -> Breaches:
         remedy = f"use constraint.solver = '{kinds[0]}' or '{kinds[1]}', or remove [network]"
         yield Breach((), f"constraint.solver = '{solver}' {problem}", remedy, None)
     for k, p in enumerate(m.phases):
-        if p.control == "body":
-            problem = f"phase {k + 1} is flown by a wrench on the body, which no vehicle computes from its neighbours"
+        if p.control not in ("open", "tracking"):
+            problem = f"phase {k + 1} has control '{p.control}', which no vehicle computes from its neighbours"
             remedy = "use control = 'tracking' or 'open', or remove [network]"
             yield Breach((), problem, remedy, None)

@@ -175,7 +175,7 @@ def _motion_time_rules(m: Draft, p: Phase, k: int, duration: float | None) -> Br
         yield from unused_key_rules(p, "blend", "reference", "shape")
     elif duration is None or p.follows_curves or not lasts > duration * (1 + 1e-9):
         return
-    elif hasattr(p, "blend"):
+    elif p.time_key == "blend":
         problem = f"is longer than the phase, which lasts {duration:g} s"
         yield Breach("blend", problem, f"use blend <= {duration:g} or end the phase later", lasts)
     else:
@@ -221,7 +221,7 @@ def _sample_count_rules(m: Draft, end: float | None) -> Breaches:
 
 def _control_rules(m: Draft, p: Phase) -> Breaches:
     """The mission has the control of a phase, and the phase what that control needs."""
-    if p.control == "body" and m.data.get("architecture", "local") == "local":
+    if p.leads_body and m.data.get("architecture", "local") == "local":
         remedy = "use control = 'tracking', or architecture = 'body' for the mission"
         yield Breach("control", "requires architecture = 'body'", remedy)
     if p.control == "open" and p.moves:
@@ -231,7 +231,7 @@ def _control_rules(m: Draft, p: Phase) -> Breaches:
     if p.control != "open" and any(p.input_force):
         problem = f"has no effect with control '{p.control}'"
         yield Breach("input_force", problem, "remove it or use control = 'open'")
-    if p.control != "tracking" and p.shaping is not None and p.shaping.position is not None:
+    if not p.tracks_slots and p.shaping is not None and p.shaping.position is not None:
         yield Breach("position", "needs tracked slots", "use control = 'tracking'")
 
 
@@ -254,7 +254,7 @@ def _establish_rules(m: Draft, p: Establish, k: int, _: float | None) -> Breache
     angles = [key for key in ANGLES if key in written]
     if p.attitude == "free" and angles:
         yield Breach(angles[0], "has no effect with attitude = 'free'", "remove one of them")
-    elif p.control != "tracking" and (angles or written.get("attitude") == "drawn"):
+    elif not p.tracks_slots and (angles or written.get("attitude") == "drawn"):
         problem = f"has no effect with control '{p.control}', which leaves the attitude free"
         remedy = (
             "use control = 'tracking', or remove this key and turn the formation in a later phase"
@@ -281,7 +281,7 @@ def _orbit_rules(m: Draft, p: Orbit, k: int, duration: float | None) -> Breaches
 
 def _tracked_way_rules(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
     """A phase with a way of its own has tracked slots and a time of arrival."""
-    if p.control == "body":
+    if p.leads_body:
         problem = f"kind '{p.kind}' cannot be flown by a wrench on the virtual body"
         yield Breach("control", problem, "use control = 'tracking'")
     if p.settle is not None:
@@ -384,13 +384,13 @@ def _reshape_rules(m: Draft, p: Reshape, k: int, _: float | None) -> Breaches:
         if len(rows) < 4 or any(len(row) != n for row in rows):
             problem = "is no list of four or more rows of slots"
             yield Breach("control_points", problem, f"give {n} points in each row", None)
-        elif p.transition != "straight" or p.alignment != "none" or p.control != "tracking":
+        elif p.transition != "straight" or p.alignment != "none" or not p.tracks_slots:
             problem = "needs tracked slots, alignment = 'none' and no transition"
             remedy = "correct these keys, or use transition = 'ways'"
             yield Breach("control_points", problem, remedy, None)
     if p.transition == "straight":
         return
-    if p.control != "tracking" or p.reference != "shape":
+    if not p.tracks_slots or p.reference != "shape":
         remedy = "use control = 'tracking' and reference = 'shape'"
         yield Breach("transition", "needs slots that are tracked", remedy)
     elif m.data.get("assignment", "given") != "given":
@@ -454,7 +454,7 @@ def _formation_use_rules(m: Draft, phases: Written) -> Breaches:
                 yield from _slot_blend_rules(shaping, form, m.n, path)
             held = shaping.formation
         form = forms.get(held) if held else None
-        tracked = p.control == "tracking" and m.is_valid(path, "control")
+        tracked = p.tracks_slots and m.is_valid(path, "control")
         if not tracked or m.n is None or form is None or not held or not has_no_findings(m, held):
             continue
         if held in slotted:
@@ -502,12 +502,12 @@ def _smoothness_rules(m: Draft, p: Phase, k: int) -> Breaches:
             problem = "needs a smooth mission" + (" to have a least time" if key in TIMES else "")
             yield Breach(key, problem, "add smoothness = 'jerk' at the top of the mission")
         return
-    if p.control == "body":
+    if p.leads_body:
         problem = "has regulators of its own, which jump at a switch; smoothness = 'jerk' needs control = 'tracking'"
         remedy = "use control = 'tracking', or remove smoothness"
         yield Breach("control", problem, remedy, p.control)
     shaping = p.shaping
-    if shaping is not None and shaping.reference == "step" and p.control == "tracking":
+    if shaping is not None and shaping.reference == "step" and p.tracks_slots:
         problem = "jumps, but the mission has smoothness = 'jerk'"
         yield Breach("reference", problem, "use reference = 'shape' or 'distances'")
     times = [at.time for at in through if at.time is not None]
@@ -532,14 +532,13 @@ def _automatic_time_rules(m: Draft, p: Phase, k: int) -> Breaches:
     keys = [key for key in p.auto_keys if m.is_valid(("phases", k), key)]
     if not keys or not m.are_ways_smooth:
         return
-    if p.control != "tracking":
+    if not p.tracks_slots:
         problem = f"needs tracked slots to have a least time, not control '{p.control}'"
         yield Breach(keys[0], problem, "use control = 'tracking', or give a time")
-    timed = p.steering or p.shaping or p.vertical or p.follows_curves or p.replaced
-    if p.duration == AUTO and not timed:
+    if p.duration == AUTO and not p.has_least_time:
         problem = f"a phase of kind '{p.kind}' has no least duration"
         yield Breach("duration", problem, "give a duration")
-    if p.duration == AUTO and timed and getattr(p, "travel", None) is not None:
+    if p.duration == AUTO and p.time_key == "travel":
         problem = "has no effect with duration = 'auto', which ends the phase at the arrival"
         yield Breach("travel", problem, "remove one of them")
     limits = m.limits
@@ -556,7 +555,7 @@ def _arrival_time_rules(m: Draft, p: Phase) -> Breaches:
     steering = p.steering
     if steering is None or steering.settle is None or steering.travel is not None:
         return
-    if m.are_ways_smooth and p.control == "tracking":
+    if m.are_ways_smooth and p.tracks_slots:
         remedy = "give travel, or end by until or duration"
         yield Breach("settle", "a smooth way needs a time of arrival", remedy, None)
     elif m.is_valid((), "lqr"):

@@ -606,7 +606,7 @@ class Aborts:
         """What follows for all at once."""
         begins = ordered + self.options.reaction
         phase = self.legs[self.leg_number_at(begins)].phase
-        if phase.control != "tracking":
+        if not phase.tracks_slots:
             reason = f"only tracked slots can slow down, and '{phase.name}' tracks none"
             return Abort(ordered, begins, (), Home(reason=reason))
         step, problem = self.slow_down_step(begins)

@@ -49,7 +49,7 @@ def certificate_of(
 
     Parameters: ``radius`` (N,) [m]; ``lost`` (N,) vehicles do not count.
     """
-    if phase.control != "tracking" or (reference.T_b == 0.0 and reference.dp.any()):
+    if not phase.tracks_slots or (reference.T_b == 0.0 and reference.dp.any()):
         return None
     return _prove_flying(reference, radius, lost)
 

@@ -105,7 +105,7 @@ class Leg:
         """Whether the agents follow the plan up to control errors; if not, it is an estimate."""
         # A shape held by constraint forces alone may lag behind its slots.
         blended = self.phase.control == "open" and self.departure.kind == SHAPE
-        return self.phase.shaping is None or self.phase.control == "tracking" or blended
+        return self.phase.shaping is None or self.phase.tracks_slots or blended
 
     @cached_property
     def motion(self) -> Motion:
@@ -173,7 +173,7 @@ class Leg:
         frame = self.frame
         if frame is not None and self.phase.control != "open":
             frame = pose.T
-        if self.phase.control != "tracking":
+        if not self.phase.tracks_slots:
             pose = None
         elif not self.smooth:
             pose = Pose(pose.r, pose.v, pose.T, pose.omega)
@@ -252,7 +252,7 @@ def _attach_frame(
         if mission.formulation == "body" and frame is None:
             frame = np.eye(3)
         return frame, now, turn
-    if phase.control == "tracking" and now.pose is not None:
+    if phase.tracks_slots and now.pose is not None:
         pose = now.pose  # the reference continues without a jump
     else:
         x, fit = about_cm(now.r, masses), now.slots
@@ -286,7 +286,7 @@ def _attach_frame(
             turn = np.eye(3)
         elif turn is not None:
             turn = axes.T @ turn
-    if phase.control == "body" or (mission.formulation == "body" and frame is None):
+    if phase.leads_body or (mission.formulation == "body" and frame is None):
         frame = pose.T
     return frame, copy_with(now, pose=pose, slots=slots, goal=goal), turn
 

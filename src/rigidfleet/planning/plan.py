@@ -17,15 +17,13 @@ import numpy as np
 from rigidfleet.errors import StoppedError
 from rigidfleet.formation import distance_geometry
 from rigidfleet.kernel.problem import (
-    BODY,
+    LAWS,
     NO_FEEDBACK,
-    OPEN,
     REST,
     RIGID,
     SHAPE,
     SOLVERS,
     SPLITS,
-    TRACKING,
     ConstraintLaw,
     Control,
     Disturbance,
@@ -136,7 +134,7 @@ class PhasePlan(Leg):
             return None
         meets, later = phase.commanded_at_arrival, since > _LATER
         stays, free = "position" not in meets, "velocity" not in meets
-        kept = stays and goal.named and phase.control == "tracking" and phase.establishing is None
+        kept = stays and goal.named and phase.tracks_slots and phase.establishing is None
         table: dict[str, Any] = {"time": t}
         if stays or (later and not free):
             table |= {"position": (goal.r + goal.v * since).tolist(), "velocity": goal.v.tolist()}
@@ -205,7 +203,7 @@ class PhasePlan(Leg):
         if self.frame is not None:
             q = y[6 * n + m : 6 * n + m + 4]
             frame = att.dcm_from_quaternion(q / np.linalg.norm(q))
-        if self.problem.control.kind == TRACKING:
+        if self.problem.control.tracks_slots:
             pose = Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
             pose = pose_at(self.problem.motion, t) if self.smooth else pose
         return copy_with(
@@ -245,15 +243,14 @@ def plan_phase(
     if shaping is not None or now.blend is None:
         d0 = now.reference.values_of(edges, lambda: distance_geometry.distances(now.r, edges))
         # Distances are those of the slots where these have the lengths commanded.
-        agree = shaping is None and phase.control == "tracking" and _agree(d1, reference.p0, edges)
+        agree = shaping is None and phase.tracks_slots and _agree(d1, reference.p0, edges)
         reference = reference._replace(kind=SHAPE if agree else reference.kind, d0=d0, d1=d1)
-    motion, feedback = REST, NO_FEEDBACK
-    if phase.control == "tracking":
-        motion = leg.motion
-    elif phase.control == "body":
+    motion, feedback = leg.motion if phase.tracks_slots else REST, NO_FEEDBACK
+    if phase.leads_body:
         assert leg.goal is not None
         feedback = _feedback(mission, phase, leg.goal, leg.start, leg.arrival)
     held = _name_if_in_formation(mission, name, now) if method == "dense" else None
+    law = LAWS[phase.control], phase.tracks_slots, phase.leads_body
     problem = Problem(
         body_formulation=mission.formulation == "body",
         has_frame=leg.frame is not None,
@@ -262,12 +259,12 @@ def plan_phase(
         law=_constraint_law(
             mission,
             mission.damping(held, now.lost),
-            damped=phase.control != "tracking" and len(edges) > 0,
+            damped=not phase.tracks_slots and len(edges) > 0,
         ),
         reference=reference,
         motion=motion,
         feedback=feedback,
-        control=part_of_mission(mission, _control, phase.control, tuple(phase.input_force)),
+        control=part_of_mission(mission, _control, law, tuple(phase.input_force)),
         disturbance=no_disturbance(masses) if disturbance is None else disturbance,
         external=_limit_integrator_step(external or External(), motion, reference),
     )  # fmt: skip
@@ -372,13 +369,12 @@ def _constraint_law(mission: Mission, mu: float, *, damped: bool) -> ConstraintL
     )
 
 
-def _control(mission: Mission, control: str, input_force: tuple[float, ...]) -> Control:
-    kind = {"open": OPEN, "tracking": TRACKING, "body": BODY}[control]
-    force = np.tile(np.array(input_force, dtype=float), (mission.n_agents, 1))
+def _control(mission: Mission, law: tuple[int, bool, bool], extra: tuple[float, ...]) -> Control:
+    force = np.tile(np.array(extra, dtype=float), (mission.n_agents, 1))
     force[:, 2] += mission.fleet.mass * mission.gravity
     allocation = mission.allocation
     method = RIGID if allocation.method == "rigid" else SPLITS[allocation.torque_split]
-    return Control(kind, force, *mission.tracking_gains, method)
+    return Control(*law, force, *mission.tracking_gains, method)
 
 
 def _feedback(mission: Mission, phase: Phase, goal: Pose, t0: float, arrival: float) -> Feedback:

@@ -156,7 +156,7 @@ def key_and_least_time(mission: Mission, leg: Leg) -> tuple[str, float | None]:
 
 def broken_limits(mission: Mission, leg: Leg) -> list[Reached]:
     """Limits that the reference of a planned leg breaks, the worst first."""
-    if leg.phase.control != "tracking":
+    if not leg.phase.tracks_slots:
         return []
     over = use_of_limits(limits_of(mission), leg.reference, leg.motion, leg.start, leg.end)
     return sorted((x for x in over if x.share > 1.0 + SLACK), key=lambda x: -x.share)

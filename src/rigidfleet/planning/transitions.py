@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -65,11 +65,9 @@ def expand_phases(mission: Mission, timed: Timed) -> Mission:
         if not phase.flown_as_written:
             so_far = data | {"phases": tables, "formations": data["formations"] | forms}
             state = partial(_state_after, mission, so_far, timed)
-            if isinstance(phase, Vertical):
-                parts = _expand_stagger(mission, k, table, phase, before, state)
-            elif isinstance(phase, Reshape):
-                parts, levels = _expand_transition(mission, k, table, phase, before, state)
-                forms |= levels
+            expand = _expand_transition if phase.vertical is None else _expand_stagger
+            parts, levels = expand(mission, k, table, cast(Any, phase), before, state)
+            forms |= levels
         tables += parts
         before = before if phase.shaping is None else phase.shaping.formation
     data |= {"phases": tables, "formations": data["formations"] | forms}
@@ -78,11 +76,13 @@ def expand_phases(mission: Mission, timed: Timed) -> Mission:
 
 #: The state at the start of a phase (`_state_after`).
 _State = Callable[[], PhaseState | None]
+#: Tables of the phases that take the place of one, and the formations that they take on the way.
+_Parts = tuple[list[dict[str, Any]], dict[str, Any]]
 
 
 def _expand_transition(
     mission: Mission, number: int, table: dict[str, Any], phase: Reshape, before: str | None, state: _State
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:  # fmt: skip
+) -> _Parts:  # fmt: skip
     """The phase with its bent ways, or the phases of a transition by layers; as it is if straight ways will do.
 
     Beside the tables of the phases, the formations that they take on the way.
@@ -102,7 +102,7 @@ def _expand_transition(
 
 def _expand_stagger(
     mission: Mission, number: int, table: dict[str, Any], phase: Vertical, before: str | None, state: _State
-) -> list[dict[str, Any]]:  # fmt: skip
+) -> _Parts:  # fmt: skip
     """The phases of a staggered take-off or landing, one for each group, or of a landing on the own places.
 
     Raises
@@ -111,7 +111,7 @@ def _expand_stagger(
         The duration leaves no time for the last group, or so much that groups would be under way together.
     """
     if phase.stagger is None:
-        return _phases_to_own_places(mission, number, table, phase, state())
+        return _phases_to_own_places(mission, number, table, phase, state()), {}
     assert isinstance(phase.duration, float)  # checked
     moving = phase.agents or tuple(range(1, mission.n_agents + 1))
     groups = [[i] for i in moving]
@@ -133,7 +133,7 @@ def _expand_stagger(
         | {"name": f"{phase.name}: {k} of {len(groups)}", "agents": group, "travel": travel}
         | {"duration": phase.stagger if k < len(groups) else travel}
         for k, group in enumerate(groups, start=1)
-    ]
+    ], {}
 
 
 def _phases_to_own_places(

@@ -15,7 +15,7 @@ import numpy as np
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.clock_records import FASTEST, OFF, RATE, VehicleClocks, shared_clock
 from rigidfleet.kernel.mail import Links, no_network
-from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
+from rigidfleet.kernel.problem import Motion, Problem, Reference
 from rigidfleet.math import series
 from rigidfleet.math.margins import Lag, LoopGains, tracking_lag_time
 from rigidfleet.math.quadrotor import ROTORS
@@ -294,7 +294,7 @@ class TickTables:
         """
         k = tick - tables.first
         before = tables.path[k] if 0 <= k < len(tables.path) else self._path_by_clocks(tick, tau)
-        if problem.control.kind == TRACKING:
+        if problem.control.tracks_slots:
             self._source = problem
         else:
             self._source, self._anchor = None, before
@@ -377,7 +377,7 @@ class TickTables:
 
         A vehicle turns with the formation, or from its yaw at the start of the phase into the one asked for.
         """
-        if problem.control.kind != TRACKING:
+        if not problem.control.tracks_slots:
             still = np.zeros((len(t), self.n, 3))
             still[..., 0] = turn.start[0]
             return still, np.zeros((0, 3, self.n, len(t)))
@@ -438,7 +438,7 @@ def yaw_turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> YawTur
 
     Where no slots are tracked, they keep their yaw.
     """
-    if problem.control.kind != TRACKING:
+    if not problem.control.tracks_slots:
         still = start * np.array([[1.0], [0.0]])
         return YawTurn(t, still, np.zeros_like(start))
     return yaw_turn(problem.reference, problem.motion, t, yaw, start)

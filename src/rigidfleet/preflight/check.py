@@ -96,7 +96,7 @@ def check(
             why = "more agents and phases would take too long"
         text = f"paths are checked only up to {preflight.judged_to:g} s: {why}"
         preflight.remarks.append(Remark("note", "paths", text))
-    if any(planned.leg.phase.control == "body" for planned in preflight.planned_phases):
+    if any(planned.leg.phase.leads_body for planned in preflight.planned_phases):
         text = "paths in phases with control = 'body' are estimates, less close the faster the formation turns"
         preflight.remarks.append(Remark("note", "paths", text))
     return preflight

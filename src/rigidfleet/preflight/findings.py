@@ -367,7 +367,7 @@ class Preflight(Shown):
     def is_show(self) -> bool:
         """Whether slots alone concern the user: all phases track them, of many agents, or without edges."""
         many = self.mission.n_agents > MANY or not len(self.mission.edges)
-        tracked = all(phase.control == "tracking" for phase in self.mission.phases)
+        tracked = all(phase.tracks_slots for phase in self.mission.phases)
         return self.mission.n_agents > 1 and many and tracked
 
     def __repr__(self) -> str:

@@ -111,13 +111,13 @@ def _check_formation(
 
 def _formation_control(mission: Mission, name: str) -> _Held:
     """What holds a formation in the phases that have it."""
-    now, controls = None, set()
+    now, tracks = None, set()
     for phase in mission.phases:
         now = phase.shaping.formation if phase.shaping is not None else now
-        controls |= {phase.control} if now == name else set()
-    if not controls:
+        tracks |= {phase.tracks_slots} if now == name else set()
+    if not tracks:
         return "nothing"
-    return "tracking" if controls == {"tracking"} else "distances"
+    return "tracking" if all(tracks) else "distances"
 
 
 def distance_mismatch_in_words(mission: Mission, name: str) -> str:
@@ -241,9 +241,9 @@ def _soft_formation_forecasts(mission: Mission, soft: set[str]) -> dict[str, tup
         slots = mission.slots_about_cm(name)
         if name is None or slots is None:
             continue
-        if phase.control != "tracking" and name in soft:
+        if not phase.tracks_slots and name in soft:
             # The paper's matrix H shares weights equally among unequal masses, and tears the shape.
-            torn = phase.control == "body" and unequal and mission.allocation.method == "pinv"
+            torn = phase.leads_body and unequal and mission.allocation.method == "pinv"
             space = 3 if torn else _dimension_spanned(r, v, unequal * np.array([phase.input_force]))
             pairs = complete_graph(len(r))
             apart = distance_geometry.distances(slots, pairs)

@@ -31,7 +31,7 @@ def check_pid_gains(mission: Mission, formations: list[FormationCheck]) -> Gains
 def gain_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on missing or slow feedback, if distances guide the agents."""
     g, phases = preflight.gains, mission.phases
-    if all(phase.control == "tracking" for phase in phases) or not len(mission.edges):
+    if all(phase.tracks_slots for phase in phases) or not len(mission.edges):
         return
     if not g.stabilised:
         yield from _no_feedback_remarks(mission)
@@ -48,7 +48,7 @@ def _no_feedback_remarks(mission: Mission) -> Iterator[Remark]:
     """Remark that without feedback an error of a distance grows at its initial rate."""
     text = "there is no feedback (stabilisation = 'none'): errors of distances remain and grow at their initial rate"
     first = mission.phases[0].establishing
-    if first is None or first.control == "tracking":
+    if first is None or first.tracks_slots:
         yield Remark("note", "gains", text)
         return
     r, v = mission.fleet.position, mission.fleet.velocity

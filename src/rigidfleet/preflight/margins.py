@@ -77,7 +77,7 @@ class ClosedLoops(NamedTuple):
 
 def tracking_closed_loops(mission: Mission, lags: Sequence[Lag]) -> ClosedLoops | None:
     """The tracking of single vehicles; None if no phase tracks slots."""
-    if not any(phase.control == "tracking" for phase in mission.phases):
+    if not any(phase.tracks_slots for phase in mission.phases):
         return None
     return ClosedLoops("tracking", tracking_loops(lags), phase_gains(mission, None, None), GROWTH)
 
@@ -121,7 +121,7 @@ def phase_gains(mission: Mission, phase: Phase | None, held: str | None) -> Loop
     law |= {key: on * getattr(c, key) for key in ("alpha", "beta", "gamma")}
     return LoopGains(
         **law, k1=k1, k2=k2, ki=mission.tracking.integral, k_def=c.deformation_damping,
-        control="tracking" if phase is None else phase.control, damping=mission.damping(held),
+        control="tracking" if phase is None or phase.tracks_slots else phase.control, damping=mission.damping(held),
     )  # fmt: skip
 
 

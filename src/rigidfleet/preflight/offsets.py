@@ -41,7 +41,7 @@ _SMALL = 0.05
 
 def sampled_tracking_offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
     """Offsets (K, N, 3) [m] of the vehicles from their slots in each planned phase; zeros where none are tracked."""
-    tracked = [planned.leg.phase.control == "tracking" for planned in way]
+    tracked = [planned.leg.phase.tracks_slots for planned in way]
     pushes = [
         _unmodelled_accelerations(mission, planned) if one else np.zeros_like(planned.position)
         for planned, one in zip(way, tracked, strict=True)

@@ -240,7 +240,7 @@ def waypoint_miss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Re
         if phase.control == "open" or goal is None or leg.arrival > leg.end:
             continue
         pose = pose_at(leg.motion, leg.arrival)
-        stays = phase.control == "tracking" and "position" not in phase.commanded_at_arrival
+        stays = phase.tracks_slots and "position" not in phase.commanded_at_arrival
         ways = ("position", pose.r, goal.r), ("velocity", pose.v, goal.v)
         meets = {x: math.dist(a, b) for x, a, b in ways if stays or x in phase.commanded_at_arrival}
         if "attitude" in phase.commanded_at_arrival and mission.n_agents > 1:
@@ -261,7 +261,7 @@ def waypoint_miss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Re
             if law.horizon == "infinite":
                 remedy = f"greater weights {table}.Q, or horizon = 'finite'"
             # Of a body under feedback, the rotation is planned as one about a fixed axis.
-            sure = exact and (phase.control == "tracking" or not is_turn)
+            sure = exact and (phase.tracks_slots or not is_turn)
             how = f"{'is' if sure else 'may be'} missed, {off:.2g} {unit} off in {what}"
             text = f"the waypoint of '{planned.phase}' {how} at {leg.arrival:.2f} s"
             text += f" (limit {most:g} {unit}): give the phase more time, or {remedy}"
@@ -273,7 +273,7 @@ def limit_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     hopeless: set[str] = set()  # limits that no time keeps; each is told once
     for planned in preflight.planned_phases:
         phase = planned.leg.phase
-        if (mission.smooth or phase.follows_curves) and phase.control == "tracking":
+        if (mission.smooth or phase.follows_curves) and phase.tracks_slots:
             # The limit that its reference breaks most, with the least time that keeps all.
             over = timing.broken_limits(mission, planned.leg)
             if over and (topic := over[0].limit.of.name_in_words) not in hopeless:

@@ -44,7 +44,7 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
     vehicle near hover, in still air, and with the yaw that the mission asks for.
     """
     models = mission.vehicle_models
-    tracked = [planned for planned in way if planned.leg.phase.control == "tracking"]
+    tracked = [planned for planned in way if planned.leg.phase.tracks_slots]
     if models is None or not tracked or all(model.point for model in models):
         return None
     setting, angle, needs = commanded_yaw(mission), initial_yaw(mission), []

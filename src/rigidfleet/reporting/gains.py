@@ -59,7 +59,7 @@ def _constraint_lines(mission: Mission) -> list[GainLine]:
     }[c.solver]
     value = f"{c.solver} ({setting})" if setting else c.solver
     lines.append(("solver", value, _SOLVERS[c.solver]))
-    if any(phase.control != "tracking" for phase in mission.phases):
+    if any(not phase.tracks_slots for phase in mission.phases):
         rate = f"{c.deformation_damping:g} /s"
         meaning = "motions that change no distance decay at this rate while no slots are tracked"
         lines.append(("deformation damping", rate, meaning))
@@ -74,7 +74,7 @@ def _solver_damping_in_words(mission: Mission) -> str:
 
 
 def _tracking_lines(mission: Mission) -> list[GainLine]:
-    if not any(phase.control == "tracking" for phase in mission.phases):
+    if not any(phase.tracks_slots for phase in mission.phases):
         return []
     k1, k2 = mission.tracking_gains
     meaning = f"each vehicle follows its slot: {_behaviour_in_words(k1, k2)}"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, NamedTuple, TypedDict
+from typing import Annotated, Any, NamedTuple, TypedDict
+
+from rigidfleet.typing import InputLaw
 
 _Three = tuple[float, float, float]
 
@@ -102,7 +104,7 @@ class PhaseRecord:
 
     name: str
     kind: str
-    control: Literal["open", "tracking", "body"]
+    control: InputLaw
     formation: str | None
     t_start: float
     t_end: float

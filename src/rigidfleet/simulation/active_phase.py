@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.problem import OPEN, TRACKING, Problem, Workspace
+from rigidfleet.kernel.problem import OPEN, Problem, Workspace
 from rigidfleet.kernel.records import IntegratorState, Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Settle
@@ -165,7 +165,7 @@ class ActivePhase:
         while self.t < (self.plan.t_end if whole else t_end):
             decided = self.lead_reference(by_law=controller is None)
             end = min(decided, self.plan.t_end if whole else t_end)
-            if controller is None or self.plan.phase.control != "tracking":
+            if controller is None or not self.plan.phase.tracks_slots:
                 self._integrate(self.plan.problem, end)
             else:
                 self._fly_under(controller, rate, end)
@@ -191,7 +191,8 @@ class ActivePhase:
         if isinstance(answer, Command):
             return self.problem_under(answer)
         force = check_force(answer, len(self.lost), "the controller", self.t)
-        control = self.plan.problem.control._replace(kind=OPEN, force=force)
+        law = self.plan.problem.control
+        control = law._replace(kind=OPEN, tracks_slots=False, leads_body=False, force=force)
         return self.plan.problem._replace(control=control)
 
     def settle_by(
@@ -226,7 +227,7 @@ class ActivePhase:
         w, vehicles = self.workspace, self.plan.problem.vehicles
         noisy = len(self.plan.problem.disturbance.noise_r) > 0
         r, v = (w.r_seen, w.v_seen) if noisy else (w.r, w.v)
-        tracked = self.plan.problem.control.kind == TRACKING  # elsewhere, there are no slots
+        tracked = self.plan.problem.control.tracks_slots  # elsewhere, there are no slots
         r_ref, v_ref, a_ref = (np.where(tracked, x, np.nan) for x in (w.r_ref, w.v_ref, w.a_ref))
         return Observation(
             self.t, self.plan.phase.name, r.copy(), v.copy(), r_ref, v_ref, a_ref, self.plan.masses.copy(), vehicles.g
@@ -313,18 +314,17 @@ class ActivePhase:
         plan, w = self.plan, self.workspace
         self.evaluate_law_now()
         errors = [np.abs(w.c).max(initial=0.0)]
-        local = plan.problem.control.kind == TRACKING
-        if local:
+        law = plan.problem.control
+        if law.tracks_slots:
             errors.append(np.linalg.norm(w.r - w.r_ref, axis=1)[~self.lost].max())
-        tracks = plan.problem.control.kind != OPEN
-        if tracks and plan.goal is not None and plan.slots is not None:
+        if law.kind != OPEN and plan.goal is not None and plan.slots is not None:
             goal, since = plan.goal, self.t - plan.arrival  # the goal moves on after arrival
             left = np.where(self.lost, 0.0, plan.masses)
             cm = left @ w.r / left.sum()
             if self.lost.any():  # of the virtual body, from the agents still flying
                 cm += w.body[0] - left @ w.r_ref / left.sum()
             errors.append(np.linalg.norm(cm - goal.r - goal.v * since))
-            turned = (w.T_ref if local else w.T) - (
+            turned = (w.T_ref if law.tracks_slots else w.T) - (
                 att.dcm_from_rotation_vector(goal.omega * since) @ goal.T
             )
             errors.append(np.linalg.norm(plan.slots @ turned, axis=1).max())
@@ -342,7 +342,7 @@ class ActivePhase:
         """Store a piece of the phase, with what the slots follow if they are tracked."""
         plan, followed = self.plan, ()
         problem, turn = plan.problem, self.turn
-        if problem.control.kind == TRACKING and len(times):
+        if problem.control.tracks_slots and len(times):
             followed = ((times[0], problem.reference, problem.motion, turn),)
         samples = times, source, integral, frame
         self.pieces.append(

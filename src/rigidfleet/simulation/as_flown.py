@@ -112,7 +112,7 @@ def check_formation_exists(mission: Mission, phase: Phase) -> None:
     if name not in known:
         problem = "there is no such formation"
         remedy = suggest(name, known) or f"formations: {', '.join(known)}"
-    elif phase.control == "tracking" and mission.formation_slots(name) is None:
+    elif phase.tracks_slots and mission.formation_slots(name) is None:
         problem = "has no slots to track"
         remedy = "give it a shape or slots, or use another control"
     if problem:

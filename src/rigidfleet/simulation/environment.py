@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from rigidfleet.errors import FlightError
-from rigidfleet.kernel.problem import TRACKING
 from rigidfleet.mission import Mission, as_mission
 from rigidfleet.planning.vehicles import network_of
 from rigidfleet.simulation.active_phase import ActivePhase
@@ -190,6 +189,6 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
         apart = r[i] - r[j]
         off = np.abs(np.sqrt((apart * apart).sum(axis=1)) - w.d[edge[held]])
         error = np.bincount(i, off, n) / np.maximum(np.bincount(i, minlength=n), 1)
-        if active.plan.problem.control.kind == TRACKING:
+        if active.plan.problem.control.tracks_slots:
             error += self.place * np.linalg.norm(r - w.r_ref, axis=1)
         return dict(zip(self.possible_agents, (-error).tolist(), strict=True))

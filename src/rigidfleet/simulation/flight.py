@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.errors import FlightError, MissionError, StoppedError, wrong_type
 from rigidfleet.kernel.avoidance import with_obstacles
-from rigidfleet.kernel.problem import TRACKING, External, Motion, Workspace, workspace
+from rigidfleet.kernel.problem import External, Motion, Workspace, workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
@@ -154,7 +154,7 @@ def simulate(
         progress=progress,
     )  # fmt: skip
     controls = {phase.name: phase.control for phase in flight.mission.phases}
-    if controller is not None and "tracking" not in controls.values():
+    if controller is not None and not any(phase.tracks_slots for phase in flight.mission.phases):
         raise FlightError(
             f"the controller would never be called, as no phase of the mission tracks slots: control is {controls};"
             " use control = 'tracking' in the phases that it is to fly, or leave the controller out"
@@ -340,7 +340,7 @@ class Flight:
         active = self.under_way()
         active.evaluate_law_now()
         w, plan = active.workspace, active.plan
-        if plan.problem.control.kind == TRACKING:
+        if plan.problem.control.tracks_slots:
             return Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
         return Pose(w.cm[0].copy(), w.cm[1].copy(), w.T.copy(), np.zeros(3))
 
@@ -525,7 +525,7 @@ class Flight:
         active = self.under_way()
         t, problem = active.t, active.plan.problem
         external = self._push if force else External()
-        if active.plan.phase.control == "body":
+        if active.plan.phase.leads_body:
             feedback = problem.feedback._replace(
                 arrival=t, r=start.r, v=start.v, T1=np.ascontiguousarray(start.T), omega=start.omega
             )
@@ -753,9 +753,9 @@ class Flight:
 
     def _stop_if_flipped(self, plan: PhasePlan) -> None:
         """Stop if the formation has flipped: its slots no longer agree with the body frame."""
-        both = {plan.phase.control, *(phase.control for phase in self._phases_begun[-1:])}
+        both = {plan.phase.leads_body, *(phase.leads_body for phase in self._phases_begun[-1:])}
         now = self._state_now
-        if self.flips or both != {"body"} or now.frame is None or plan.frame is None:
+        if self.flips or not all(both) or now.frame is None or plan.frame is None:
             return
         angle = att.angle_between(
             att.quaternion_from_dcm(now.frame), att.quaternion_from_dcm(plan.frame)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from rigidfleet.errors import FlightError
 from rigidfleet.kernel.fleet import ANSWERED, TICKS, SampledFlight, SampledState
 from rigidfleet.kernel.mail import NONE
-from rigidfleet.kernel.problem import TRACKING, Problem, Workspace
+from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.simulation.callbacks import call_user_code, copy_finite_array
 from rigidfleet.typing import Floats
 
@@ -144,7 +144,7 @@ class OwnLaws:
         has_edge, held = (mail.edge != NONE).tolist(), mail.edge >= 0
         self.lengths[:, held] = w.d[mail.edge[held]], w.d_dot[mail.edge[held]]
         (d, d_dot), stamps = self.lengths.tolist(), mail.stamp.tolist()
-        tracks = problem.control.kind == TRACKING
+        tracks = problem.control.tracks_slots
         slots = [w.r_ref, w.v_ref, w.a_ref] if tracks else [np.full_like(w.r, np.nan)] * 3
         known, masses = np.stack([w.r, w.v, *slots], axis=1), problem.vehicles.m.tolist()
         views: list[View | None] = [None] * len(masses)

@@ -15,7 +15,7 @@ from rigidfleet.kernel.clock_records import OFF, PACE, RATE, WORST
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
 from rigidfleet.kernel.mail import CLOCK, Links, Mail, give_edges_to_links
-from rigidfleet.kernel.problem import ITERATED, TRACKING, Problem
+from rigidfleet.kernel.problem import ITERATED, Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
@@ -120,7 +120,7 @@ class SampledPhase(ActivePhase):
         self.unjudged = False  # whether steps were flown since the extremes of vehicles were taken
         self.first_tick: int | None = None
         self.leader: Leader | None = None
-        if vehicles.layers is not None and plan.problem.control.kind == TRACKING:
+        if vehicles.layers is not None and plan.problem.control.tracks_slots:
             period = self.flight.every * self.flight.steps * self.flight.h
             self.leader = Leader(vehicles.layers, plan, period)
             self.leader.deviation.scale = vehicles.scale
@@ -457,7 +457,7 @@ class SampledPhase(ActivePhase):
         off, rate = tau[:, ~self.flight.vehicles.lost, :2].mean(axis=1).T
         f_E = native.record(problem, work, times, y).f_E
         planned = native.record(problem, work, times + off, y)._replace(f_E=f_E)
-        if problem.control.kind == TRACKING:
+        if problem.control.tracks_slots:
             r_ref = slots_by_own_clocks(problem.reference, problem.motion, times, tau)[:, 0]
             planned = planned._replace(r_ref=r_ref)
         for x in (planned.motion[:, 3:], planned.rates, planned.d_dot):

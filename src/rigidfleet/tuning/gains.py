@@ -55,7 +55,7 @@ def own_gains(mission: Mission) -> Gains:
         own |= {
             "constraint.alpha": c.alpha, "constraint.beta": c.beta, "constraint.gamma": c.gamma
         }  # fmt: skip
-    if any(phase.control == "tracking" for phase in mission.phases):
+    if any(phase.tracks_slots for phase in mission.phases):
         own |= {"tracking.Q.1": t.Q[0], "tracking.Q.2": t.Q[1], "tracking.integral": t.integral}
     return {path: gain for path, gain in own.items() if gain > 0}
 

@@ -112,7 +112,7 @@ def tune(
     flown = own_mission.rewritten(_merge_keys(own_mission.to_dict(), assume or {}))
     paths = _seed_paths(flown)
     seeds, validation = (seeds, validation) if paths else (1, 0)
-    if objective == "shape" and True not in _phase_tracking_flags(flown):
+    if objective == "shape" and not any(phase.tracks_slots for phase in flown.phases):
         objective = "shape-forces"
     options = {
         "objective": objective, "seeds": seeds, "validation": validation, "seed": seed,
@@ -136,11 +136,6 @@ def tune(
     return tuned
 
 
-def _phase_tracking_flags(mission: Mission) -> set[bool]:
-    """Whether phases track slots: what is true of any of them."""
-    return {phase.control == "tracking" for phase in mission.phases}
-
-
 def _option_problems(mission: Mission, budget: int, options: Mapping[str, Any]) -> Iterator[str]:
     """What is wrong with options, or with a mission in which there is nothing to tune."""
     name, objective = mission.name, options["objective"]
@@ -158,7 +153,7 @@ def _option_problems(mission: Mission, budget: int, options: Mapping[str, Any]) 
     if not own_gains(mission):
         yield f"{name}: has no gains to tune: no phase tracks slots, and no edges are stabilised."
     slots = objective != "shape-forces"
-    if slots not in _phase_tracking_flags(mission):
+    if slots not in {phase.tracks_slots for phase in mission.phases}:
         which, other = ("no", "shape-forces") if slots else ("every", "shape")
         yield f"objective = {objective!r}: {which} phase of {name} tracks slots. Use {other}."
     if mission.vehicle_models is None and mission.disturbances is None:

@@ -165,7 +165,7 @@ def _examples() -> tuple[Any, ...]:
         reference=Reference(CONSTANT, 0.0, 0.0, none, none, places, places, np.zeros(3)),
         motion=REST,
         feedback=NO_FEEDBACK,
-        control=Control(OPEN, places, 0.0, 0.0, RIGID),
+        control=Control(OPEN, False, False, places, 0.0, 0.0, RIGID),
         disturbance=no_disturbance(one),
     )  # fmt: skip
     state = integrator(np.zeros(6), 0.0, rtol=0.0, atol=np.ones(6))

@@ -357,7 +357,7 @@ class Pilot:
         """The pose that the first phase begins with."""
         flight, frame = self.flight, self.flight.plan.frame
         pose = flight.pose()
-        if flight.plan.phase.control == "tracking":
+        if flight.plan.phase.tracks_slots:
             return pose
         seen = flight.observe()
         total = self.masses.sum()
