@@ -128,7 +128,7 @@ def test_help_is_light():
 
 
 def test_completion(tmp_path):
-    """What is installed for bash completes every verb, and the options of a verb, in a home that has nothing yet."""
+    """What is installed for bash completes verbs, options and shipped missions, in a home that has nothing yet."""
     if (bash := shutil.which("bash")) is None:
         pytest.skip("no bash here")
     home = {"HOME": str(tmp_path), "PATH": os.environ["PATH"]}
@@ -140,13 +140,35 @@ def test_completion(tmp_path):
     COMP_WORDS=(rigidfleet ""); COMP_CWORD=1; $call; echo "${COMPREPLY[@]}"
     COMP_WORDS=(rigidfleet sweep --w); COMP_CWORD=2; $call; echo "${COMPREPLY[@]}"
     """
+    table = Path(__file__).parents[1].joinpath("README.md").read_text("utf-8")
+    flown = [*re.findall(r"^\| `rigidfleet (\w+) MISSION", table, re.MULTILINE)]
+    assert {"run", "check", "sweep", "live", "tune"} <= {*flown}
+    before = [*flown, "missions --print", "assess --mission"]
+    for words in before:
+        script += (
+            f'COMP_WORDS=(rigidfleet {words} ""); COMP_CWORD={1 + len(words.split())}; $call\n'
+        )
+        script += 'echo "${COMPREPLY[@]}"\n'
     done = subprocess.run(
         [bash, "-c", script], env=home, capture_output=True, text=True, check=False
     )
-    verbs, options = done.stdout.splitlines()
-    table = Path(__file__).parents[1].joinpath("README.md").read_text("utf-8")
+    verbs, options, *names = done.stdout.splitlines()
     assert {*re.findall(r"^\| `rigidfleet (\w+)", table, re.MULTILINE)} <= {*verbs.split()}
     assert options.split() == ["--workers"]
+    assert {x: y.split() for x, y in zip(before, names, strict=True)} == dict.fromkeys(
+        before, mission_names()
+    )
+
+
+@pytest.mark.parametrize("verb", [name for name in cli.app if not name.startswith("-")])
+def test_help_breaks_no_line_that_fits(verb, monkeypatch, capsys):
+    """On a wide terminal each paragraph of the help, and of each option, stands in one line."""
+    monkeypatch.setenv("COLUMNS", "2000")
+    assert cli.main([verb, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "─ Parameters ─" in text
+    assert not re.findall(r"(?m)^│ {7,}\S.*", text)  # below the text of an option
+    assert not re.findall(r"(?m)^\w.*\n\w.*", text)
 
 
 def test_module_is_the_command():
@@ -183,8 +205,9 @@ def test_bad_input(capsys, tokens, words):
 # -- missions, check ---------------------------------------------------------------------------------
 
 
-def test_missions(capsys):
+def test_missions(capsys, monkeypatch):
     """Each shipped mission has one line below its group, with its table or figure of the paper."""
+    monkeypatch.setenv("COLUMNS", "200")
     assert cli.main(["missions"]) == codes.PASSED
     head, *lines, empty, first = capsys.readouterr().out.splitlines()
     assert "in the paper" in head
@@ -222,22 +245,28 @@ def test_a_trajectory_is_no_mission(verb, tmp_path, capsys):
     assert "trajectories are judged by `rigidfleet assess`" in capsys.readouterr().err
 
 
-def test_check(capsys):
-    """A mission that is right is counted up, and its phases are listed."""
+def test_check(capsys, monkeypatch):
+    """A mission that is right is counted up, and its phases are listed; in a pipe no line is longer than 80."""
+    assert cli.main(["check", "narrow-passage"]) == codes.PASSED
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert any("guide" in line for line in lines)
+    console.console.cache_clear()
+    monkeypatch.setenv("COLUMNS", "100")
     assert cli.main(["check", "narrow-passage"]) == codes.PASSED
     first, _, *lines = capsys.readouterr().out.splitlines()
     assert first == "narrow-passage: valid: 3 agents, 2 formations, 12 phases, 90 s"
     phases, facts = lines[: lines.index("")], lines[lines.index("") :]
     assert len(phases) == 12
     assert facts[-1] == "narrow-passage: no problems found"
-    assert max(len(line) for line in facts if "guide" in line) <= 80
     assert "infinitesimally rigid" in facts[2]
     wp2 = "WP2 fly (35, 7.5, 20) m, (2, 0, 0) m/s, yaw 0° at 32 s tracking"
     assert " ".join(phases[3].split()) == f"4 {wp2}"
 
 
-def test_check_words(capsys):
+def test_check_words(capsys, monkeypatch):
     """Ends by settling or duration are told apart, and turned angles are named."""
+    monkeypatch.setenv("COLUMNS", "100")
     text = (
         RESTLESS
         + '[[phases]]\nkind = "turn"\nroll_deg = 5\nrates_deg_s = [0, 0, 1]\nduration = 4\n'
@@ -984,8 +1013,8 @@ def test_report_of_several(capsys, plot):
 
 
 def test_piped_output_is_plain():
-    """What goes to a pipe has no colours and no animation, and no row of a table is broken."""
-    done = command("missions", TERM="xterm-256color")
+    """What goes to a pipe has no colours and no animation, and no row of a table is broken that fits COLUMNS."""
+    done = command("missions", TERM="xterm-256color", COLUMNS="160")
     assert "\x1b" not in done.stdout + done.stderr
     assert len(done.stdout.splitlines()) == 1 + len(GROUPS) + len(mission_names()) + 2
 

@@ -3,6 +3,7 @@
 import html
 import io
 import json
+import os
 import re
 import xml.etree.ElementTree as ET
 from collections import Counter
@@ -327,11 +328,37 @@ def test_the_page_has_the_tables_of_its_objects(flights):
                 assert all(row in rows for row in rows_of(part.html()))
 
 
+SHOWS = ["show", "show-1000", "market-square"]
+
+
+@pytest.mark.parametrize("name", SHOWS)
+def test_a_show_is_checked_for_nothing_of_edges_and_laws(name):
+    """Of shows that ship, as of one that is made up, spacing is shown, and no edges, solvers, gains and margins."""
+    ahead = checked(name)
+    assert ahead.is_show
+    words = plain(printed(ahead))
+    alien = r"gain|overshoot|rigid|edge|distances|margin|phase \[deg\]|delay|solve|gradients|factor"
+    assert not re.search(alien, words), words
+    assert f"spacing, centre to centre {value(ahead.formations[0].spacing_m)} m" in words
+    assert words.endswith("no problems found")
+
+
+def test_a_show_whose_tracking_is_unstable_has_its_margins():
+    """Where lag and delay make the tracking of a show unstable, its check shows the margins, and what to do."""
+    data = rf.load_mission("market-square").to_dict()
+    data["tracking"]["integral"] = 50.0
+    ahead = check(rf.load_mission("market-square").rewritten(data))
+    assert ahead.is_show
+    assert not ahead.passed
+    words = plain(printed(ahead))
+    assert "margins tracking unstable" in words
+    assert "lower tracking.Q" in words
+
+
 def test_a_show_is_checked_for_what_concerns_it():
-    """Spacing, start, speeds, proof and lights are told of tracked slots without edges; gains and rigidity are not."""
+    """Spacing, start, speeds, proof and lights are told of tracked slots without edges."""
     ahead = checked("show")
     words = plain(printed(ahead))
-    assert not re.search(r"gains|overshoot|rigid|edges|distances", words), words
     assert "spacing, centre to centre 2 m start" in words
     assert "spacing, centre to centre 2.5 m 'ball'" in words
     assert re.search(r"speed \S+ m/s <= 6 m/s", words)
@@ -450,6 +477,26 @@ def test_lists_of_the_command_fit_eighty_columns(line, capsys, monkeypatch):
     # A sentence is left to the terminal to wrap, so that it can be copied.
     rows = [row for row in texts[0].splitlines() if not row.startswith("Look first")]
     assert max(map(len, rows)) <= 80
+    assert not Counter(texts[1].split()) - Counter(texts[0].split())
+
+
+@pytest.mark.parametrize(("columns", "width"), [(None, 80), ("0", 80), ("110", 110)])
+@pytest.mark.parametrize("line", [["missions"], ["check", "ferris-wheel"]])
+def test_tables_in_a_pipe_fit_eighty_columns(line, columns, width, capsys, monkeypatch):
+    """In a pipe, tables fit COLUMNS, or else 80 columns, however wide a terminal behind it is; no word is lost."""
+    monkeypatch.setattr(os, "get_terminal_size", lambda *_: os.terminal_size((300, 50)))
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    texts = []
+    for size in (columns, "400"):
+        console.console.cache_clear()
+        monkeypatch.delenv("COLUMNS", raising=False)
+        if size is not None:
+            monkeypatch.setenv("COLUMNS", size)
+        assert app.main(line) == 0
+        texts.append(capsys.readouterr().out)
+    console.console.cache_clear()
+    rows = [row for row in texts[0].splitlines() if not row.startswith("Look first")]
+    assert width - 10 < max(map(len, rows)) <= width
     assert not Counter(texts[1].split()) - Counter(texts[0].split())
 
 

@@ -264,9 +264,9 @@ class Sheet:
         """The parts, without tables in which nothing stands."""
         return [part for part in self.parts if isinstance(part, Line) or part.rows]
 
-    @property
-    def printed_blocks(self) -> list[Any]:
+    def __rich__(self) -> RenderableType:
         """What is printed: the head, and the parts with blank lines around tables."""
+        from rich.console import Group
         from rich.text import Text
 
         head = Text.assemble((self.name, "bold"), f": {self.title}" * bool(self.title))
@@ -275,12 +275,7 @@ class Sheet:
         for part, before in zip(self.shown_parts, [Line(""), *self.shown_parts], strict=False):
             apart = isinstance(part, FactTable) or isinstance(before, FactTable)
             blocks += ["", part] if apart and blocks != begin else [part]
-        return blocks
-
-    def __rich__(self) -> RenderableType:
-        from rich.console import Group
-
-        return Group(*self.printed_blocks)
+        return Group(*blocks)
 
     def html(self) -> str:
         """Show the sheet in a notebook. All text is escaped."""

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import sys
 import traceback
 import warnings
@@ -66,7 +67,13 @@ _COMMANDS = (
     run.run, run.missions, check.check, design.design, new.new, assess.assess, report.report, report.replay,
     export.export, live.live, sweep.sweep, tune.tune,
 )  # fmt: skip
+#: Lines below each other that are indented alike, and not what underlines a heading.
+_PARAGRAPH = re.compile(r"(?m)^( *)(?!-+$)\S.*(\n\1(?!-+$)\S.*)+")
 for _key, _command in enumerate(_COMMANDS, start=1):
+    # Paragraphs are wrapped by the width of the terminal, not where lines of the source end.
+    _command.__doc__ = _PARAGRAPH.sub(
+        lambda match: match[1] + " ".join(match[0].split()), _command.__doc__ or ""
+    )
     app.command(_command, sort_key=_key)
 app.register_install_completion_command(help="Complete words with Tab in this user's shell.")
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter, validators
 
@@ -18,6 +19,11 @@ def to_whole_number(_type: Any, tokens: Sequence[Any]) -> int:
 Workers = Annotated[
     int | None, Parameter(converter=to_whole_number, validator=validators.Number(gte=1))
 ]
+
+
+_SHIPPED = sorted(path.stem for path in Path(__file__).parents[1].glob("missions/*.toml"))
+#: A file, or the name of a shipped mission, which a shell completes.
+MissionName = Annotated[Literal[tuple(_SHIPPED)] | str, Parameter(show_choices=False)]  # ty: ignore[invalid-type-form]
 
 
 def parse_number(text: str, what: str = "") -> float:

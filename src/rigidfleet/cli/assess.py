@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from rigidfleet._common.quantities import LIMITS_OF_CURVES
 from rigidfleet.cli import console
+from rigidfleet.cli.arguments import MissionName
 from rigidfleet.cli.codes import FAILED, PASSED, UNDECIDED
 from rigidfleet.cli.outputs import Files
 from rigidfleet.errors import RigidfleetError
@@ -30,7 +31,7 @@ _READ = ("interpolation", "spans", "gaps", "units", "axes", "topic", "origin")
 
 def assess(
     *files: Path,
-    mission: str | None = None,
+    mission: MissionName | None = None,
     separation: float | None = None,
     separation_altitude: float | None = None,
     limits: Annotated[list[str] | None, Parameter(help=_LIMITS)] = None,

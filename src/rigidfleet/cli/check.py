@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
+from rigidfleet.cli.arguments import MissionName
 from rigidfleet.cli.outputs import refuse_overwriting, with_toml_suffix
 from rigidfleet.errors import MissionError, RigidfleetError
 
@@ -17,7 +18,7 @@ from rigidfleet.cli.codes import BAD_INPUT, FAILED, PASSED
 
 
 def check(
-    mission: str,
+    mission: MissionName,
     /,
     *,
     realisations: Annotated[bool | None, Parameter(negative="--no-realisations")] = None,
@@ -92,7 +93,7 @@ def check(
         if json:
             console.print_json({"mission": mission, "right": True} | home.data())
         else:
-            console.print_sheet(home.facts())
+            console.out().print(home.facts())
             if out is not None:
                 console.out().print(f"\nAborts   {out}", soft_wrap=True)
         return PASSED
@@ -108,7 +109,7 @@ def check(
     if json:
         console.print_json({"mission": mission, "right": True} | plain_facts(loaded) | ahead.data())
         return PASSED if ahead.passed else FAILED
-    console.print_sheet(ahead.facts())
+    console.out().print(ahead.facts())
     if expand is not None:
         console.out().print(f"\nMission  {expand}", soft_wrap=True)
     return PASSED if ahead.passed else FAILED

@@ -1,6 +1,6 @@
 """Output of the command: results on standard output, progress and errors on standard error.
 
-Colours and animation are for terminals only. Rows of tables are not wrapped in a file or a pipe.
+Colours and animation are for terminals only. A file or a pipe is as wide as COLUMNS says, or else 80 columns.
 """
 
 from __future__ import annotations
@@ -20,13 +20,10 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-    from rigidfleet._common.facts import Sheet
     from rigidfleet.assessment import Verdict
     from rigidfleet.simulation.flight import Progress as FlightProgress
     from rigidfleet.sweep import SweepProgress
 
-#: Width of a table in a file or a pipe, where rows are not wrapped [characters].
-_WIDE = 1000
 #: Time between lines of progress if there is no terminal for a progress bar [s].
 _SELDOM = 10.0
 #: Least time between pictures of a progress bar that no thread draws [s].
@@ -52,8 +49,8 @@ def err() -> Console:
 
 
 @cache
-def console(*, stderr: bool, width: int | None = None) -> Console:
-    """Return the shared console for standard output or error, with its own or a given width."""
+def console(*, stderr: bool) -> Console:
+    """Return the shared console for standard output or error."""
     from rich.console import Console
 
     class Polite(Console):
@@ -62,7 +59,10 @@ def console(*, stderr: bool, width: int | None = None) -> Console:
             self.quiet = True
             discard_output(self.file)
 
-    return Polite(stderr=stderr, width=width, markup=False, highlight=False, emoji=False)
+    shared = Polite(stderr=stderr, markup=False, highlight=False, emoji=False)
+    if not shared.is_terminal and os.environ.get("COLUMNS", "") in ("", "0"):
+        shared.width = 80  # however wide a terminal is that this process has beside its pipe
+    return shared
 
 
 def prepare_streams() -> None:
@@ -117,15 +117,6 @@ def print_error(error: object) -> None:
 def warn(message: object, *_where: object) -> None:
     """Print a warning as one line, without its place in the source."""
     err().print(f"warning: {message}", style="yellow", soft_wrap=True, highlight=False)
-
-
-def print_sheet(sheet: Sheet) -> None:
-    """Print facts: in a file or a pipe, rows of tables are not wrapped."""
-    from rigidfleet._common.facts import FactTable
-
-    wide = out() if out().is_terminal else console(stderr=False, width=_WIDE)
-    for block in sheet.printed_blocks:
-        (wide if isinstance(block, FactTable) and not block.bare else out()).print(block)
 
 
 class _Screen:

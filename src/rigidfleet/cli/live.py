@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import to_whole_number
+from rigidfleet.cli.arguments import MissionName, to_whole_number
 from rigidfleet.cli.outputs import Files
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ from rigidfleet.cli.run import raise_interrupts
 
 
 def live(
-    mission: str,
+    mission: MissionName,
     /,
     *,
     out: Path | None = None,

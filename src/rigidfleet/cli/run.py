@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
+from rigidfleet.cli.arguments import MissionName
 from rigidfleet.cli.outputs import Files
 from rigidfleet.errors import RigidfleetError
 
@@ -25,7 +26,7 @@ DRAWN: tuple[Format, ...] = ("png",)
 
 
 def run(
-    mission: str,
+    mission: MissionName,
     /,
     *,
     out: Path | None = None,
@@ -127,7 +128,7 @@ def run(
 
 
 def missions(
-    *, print_: Annotated[str, Parameter(name="--print")] = "", schema: bool = False
+    *, print_: Annotated[MissionName, Parameter(name="--print")] = "", schema: bool = False
 ) -> int:
     """List the shipped missions, in groups.
 
@@ -150,7 +151,7 @@ def missions(
     else:
         import tomllib
 
-        from rigidfleet._common.facts import FactTable, Row, Sheet
+        from rigidfleet._common.facts import FactTable, Row
 
         def row(name: str) -> Row:
             head = tomllib.loads(mission_text(name))
@@ -161,7 +162,7 @@ def missions(
         ]
         heads = ("mission", "what it shows", "in the paper")
         first = f"\nLook first at {', '.join(FIRST)}: rigidfleet run {FIRST[0]}"
-        console.print_sheet(Sheet("", "", [FactTable(heads, rows, heads)]))
+        console.out().print(FactTable(heads, rows, heads))
         console.out().print(first, soft_wrap=True)
     return PASSED
 

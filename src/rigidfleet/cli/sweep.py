@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import Workers, to_whole_number
+from rigidfleet.cli.arguments import MissionName, Workers, to_whole_number
 from rigidfleet.cli.codes import BAD_INPUT, INTERRUPTED, PASSED
 from rigidfleet.cli.run import DRAWN, Format, show_progress
 from rigidfleet.errors import RigidfleetError
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def sweep(
-    mission: str,
+    mission: MissionName,
     /,
     *,
     vary: list[str] | None = None,
@@ -152,7 +152,7 @@ def sweep(
     if json:
         console.print_exactly(outcome.json() + "\n")
     elif not quiet:
-        console.print_sheet(outcome.facts())
+        console.out().print(outcome.facts())
     drawn = [] if no_figures or shard else figures.plot(
         table, folder / "figures", formats=format or DRAWN, over=map_ or (), metric=metric,
         titles=not no_titles,

@@ -9,14 +9,14 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import Workers, to_whole_number
+from rigidfleet.cli.arguments import MissionName, Workers, to_whole_number
 from rigidfleet.cli.codes import INTERRUPTED, PASSED
 from rigidfleet.cli.run import show_progress
 from rigidfleet.errors import RigidfleetError
 
 
 def tune(
-    mission: str,
+    mission: MissionName,
     /,
     *,
     objective: Literal["shape", "shape-rms", "shape-forces", "tracking", "tracking-rms"] = "shape",
@@ -87,7 +87,7 @@ def tune(
     if json:
         console.print_json(tuned.to_dict()["result"])
     elif not quiet:
-        console.print_sheet(tuned.facts())
+        console.out().print(tuned.facts())
         console.out().print(f"\nMission  {tuned.file}", soft_wrap=True)
         console.out().print(f"Study    {folder / 'study.json'}", soft_wrap=True)
     return PASSED

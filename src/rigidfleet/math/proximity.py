@@ -20,7 +20,7 @@ _MANY = 200
 
 
 # Number of agents whose nearest neighbours give a first estimate.
-_ASKED = 256
+_SAMPLE = 256
 
 
 # Number of values that fit into the processor's cache.
@@ -115,7 +115,7 @@ def _closest_pair_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
     from scipy.spatial import KDTree
 
     least, pair = np.empty(len(r)), np.empty((len(r), 2), dtype=np.int64)
-    some = np.arange(0, len(radius), max(1, len(radius) // _ASKED))
+    some = np.arange(0, len(radius), max(1, len(radius) // _SAMPLE))
     for k, points in enumerate(r):
         p = np.ascontiguousarray(points.T)
         p -= p.mean(axis=1, keepdims=True)

@@ -31,7 +31,7 @@ _MASS, _RADIUS, _SLIM = 0.3, 0.15, 1 / 8
 #: Least height of a slot above the ground and of the whole show [m], and of a vehicle that stands.
 _ALOFT, _LOWEST, _STANDS = 5.0, 10.0, 0.05
 #: Share of the distance that is proved, which the mission asks for.
-_ASKED = 0.9
+_SHARE = 0.9
 #: Times to hold each formation, and to settle after a change [s].
 _SHOWN, _SETTLED = 4.0, 1.0
 #: Rise of a turn of a helix, in spacings.
@@ -154,7 +154,7 @@ def show_mission_text(
         })  # fmt: skip
         taken.add(one.name)
         places, lasts = slots, lasts + blend + shown
-    separation = math.floor(100 * _ASKED * (spacing / math.sqrt(2) - 2 * radius)) / 100
+    separation = math.floor(100 * _SHARE * (spacing / math.sqrt(2) - 2 * radius)) / 100
     if separation <= 0.0:
         raise ValueError(f"a spacing of {spacing:g} m is too small for a show")
     what = f"A show of {agents} vehicles: {', '.join(one.name for one in scenes)}"

@@ -193,8 +193,8 @@ def _extent(thing: Obstacle, frame: Floats) -> Floats:
     return records.swept_extent(turned)
 
 
-class Way(NamedTuple):
-    """A way that was found: a place (3,) [m] and a layer for each stop, in order."""
+class Stops(NamedTuple):
+    """The stops of a way, in order: a place (3,) [m] and a layer of each."""
 
     places: list[Floats]
     layers: list[int]
@@ -271,8 +271,8 @@ class Roadmap:
         at = [int(np.abs(x.axes[k] - place[k]).argmin()) for k in range(3)]
         return int(self.first[0, layer] + np.ravel_multi_index(at, x.shape))
 
-    def shortest_way(self, begin: Stop, end: Stop) -> Way | None:
-        """The way of least cost from a place and layer to others; None if there is none."""
+    def stops_of_shortest_way(self, begin: Stop, end: Stop) -> Stops | None:
+        """The stops of the way of least cost from a place and layer to others; None if there is none."""
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import dijkstra
 
@@ -287,18 +287,17 @@ class Roadmap:
         while nodes[-1] != a:
             nodes.append(int(before[nodes[-1]]))
         nodes.reverse()
-        return Way(
-            [self.points[k] for k in nodes], [int(self.layer_of[k]) for k in nodes], float(cost[b])
-        )
+        places, layers = [self.points[k] for k in nodes], [int(self.layer_of[k]) for k in nodes]
+        return Stops(places, layers, float(cost[b]))
 
-    def shorten_way(self, way: Way) -> Way:
-        """The way with fewer stops: straight where that is proved, with changes at stops or half-way between them."""
-        stops = list(zip(way.places, way.layers, strict=True))
+    def stops_of_shorter_way(self, stops: Stops) -> Stops:
+        """The stops of a way that is straight where that is proved, with changes at stops or half-way between them."""
+        each = list(zip(stops.places, stops.layers, strict=True))
         for _ in range(_SHORTER):
-            stops = self._move_changes(self._straighten(stops))
-        ends = way.places[0], way.places[-1]
-        places = [p if any(p is end for end in ends) else np.round(p, 3) for p, _ in stops]
-        return Way(places, [k for _, k in stops], way.cost)
+            each = self._move_changes(self._straighten(each))
+        ends = stops.places[0], stops.places[-1]
+        places = [p if any(p is end for end in ends) else np.round(p, 3) for p, _ in each]
+        return Stops(places, [k for _, k in each], stops.cost)
 
     def _is_free(self, a: Stop, b: Stop) -> bool:
         """Whether the motion from one stop to another is proved: straight in one layer, or a change on the spot."""

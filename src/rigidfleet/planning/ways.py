@@ -24,7 +24,7 @@ from rigidfleet.mission.kinds import ANGLES, Go
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import layers
 from rigidfleet.planning.clearance import clearance_to, speed_bounds
-from rigidfleet.planning.lattice import FreeSpace, Layer, Roadmap, Way, constant_path
+from rigidfleet.planning.lattice import FreeSpace, Layer, Roadmap, Stops, constant_path
 from rigidfleet.planning.legs import Leg, latest_end, state_at_start
 from rigidfleet.planning.preview import FEWEST_SAMPLES, sample_leg, samples_per_phase
 from rigidfleet.planning.reference import PhaseState
@@ -129,8 +129,8 @@ class _Search:
         """The mission with the way's phases in place of this one."""
         need = self.phase.clearance + _KEPT
         for _ in range(_TRIES):
-            way = self._cheapest_way(need)
-            mission, lacking = self._mission_and_shortfall(*way)
+            best = self._stops_of_cheapest_way(need)
+            mission, lacking = self._mission_and_shortfall(*best)
             if lacking <= 0.0:
                 return mission
             need += lacking + _KEPT
@@ -138,9 +138,9 @@ class _Search:
         remedy = "give more time, or ask for less clearance"
         raise self.mistake("clearance", self.phase.clearance, problem, remedy)
 
-    def _cheapest_way(self, need: float) -> tuple[Roadmap, Way]:
+    def _stops_of_cheapest_way(self, need: float) -> tuple[Roadmap, Stops]:
         """The way of least cost among shapes: more shapes, and then more yaws, as long as there is no short one."""
-        best: tuple[Roadmap, Way] | None = None
+        best: tuple[Roadmap, Stops] | None = None
         straight = float(np.linalg.norm(self.end - self.begin))
         stages = sorted({s.stage for s in self.shapes})
         for stage, more in [*((k, False) for k in stages), (stages[-1], True)]:
@@ -151,14 +151,14 @@ class _Search:
                 f"looking for a way of '{self.phase.name}' round obstacles, shapes: {len(shapes)}"
             )
             roadmap = self._roadmap(shapes, need, more=more)
-            way = roadmap.shortest_way((self.begin, 0), (self.end, self._last))
-            if way is not None and (best is None or way.cost < best[1].cost):
-                best = roadmap, way
+            stops = roadmap.stops_of_shortest_way((self.begin, 0), (self.end, self._last))
+            if stops is not None and (best is None or stops.cost < best[1].cost):
+                best = roadmap, stops
             if best is not None and best[1].cost <= _SHORT * straight + self.reach:
                 break
         if best is None:
             raise self._no_way_error(roadmap)
-        return best[0], best[0].shorten_way(best[1])
+        return best[0], best[0].stops_of_shorter_way(best[1])
 
     def _roadmap(self, shapes: list[layers.CandidateShape], need: float, *, more: bool) -> Roadmap:
         frames = layers.lattice_frames(self._near_obstacles_at_rest())
@@ -199,11 +199,11 @@ class _Search:
 
     # -- from nodes to phases --------------------------------------------------------------------------
 
-    def _phases(self, roadmap: Roadmap, way: Way) -> Iterator[tuple[str, dict[str, Any], float]]:
-        """Name, keys and greatest way [m] of an agent, of each phase of a way."""
+    def _parts(self, roadmap: Roadmap, stops: Stops) -> Iterator[tuple[str, dict[str, Any], float]]:
+        """Name, keys and greatest way [m] of an agent, of each part of a way, which becomes a phase."""
         changes = {frozenset((c.before, c.after)): float(c.ways.max()) for c in roadmap.changes}
         written = self._formation_names_in_file()
-        for (a, i), (b, j) in pairwise(zip(way.places, way.layers, strict=True)):
+        for (a, i), (b, j) in pairwise(zip(stops.places, stops.layers, strict=True)):
             layer = roadmap.layers[j]
             if i == j:
                 place = f"to ({', '.join(f'{x:.4g}' for x in b)})"
@@ -225,10 +225,10 @@ class _Search:
             if p.shaping is not None
         }
 
-    def _phase_tables(self, roadmap: Roadmap, way: Way) -> list[dict[str, Any]]:
+    def _phase_tables(self, roadmap: Roadmap, stops: Stops) -> list[dict[str, Any]]:
         """The phases of a way as tables; times are shared like the roots of the longest ways, or automatic."""
         phase = self.phase
-        parts = list(self._phases(roadmap, way))
+        parts = list(self._parts(roadmap, stops))
         if not parts:
             parts = [("stay", {"kind": "fly", "position": self.end.tolist()}, 1.0)]
         end = latest_end(phase, self.now.t)
@@ -256,10 +256,10 @@ class _Search:
                 del last["duration"]
         return tables
 
-    def _mission_and_shortfall(self, roadmap: Roadmap, way: Way) -> tuple[Mission, float]:
+    def _mission_and_shortfall(self, roadmap: Roadmap, stops: Stops) -> tuple[Mission, float]:
         """The mission with a way, and the clearance [m] that its proof lacks: that of every vehicle, in time."""
         mission, k = self.mission, self.number
-        data, tables = mission.to_dict(), self._phase_tables(roadmap, way)
+        data, tables = mission.to_dict(), self._phase_tables(roadmap, stops)
         forms = {
             name: mission.formations[name].model_dump(
                 mode="json", exclude_none=True, exclude_defaults=True

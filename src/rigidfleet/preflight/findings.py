@@ -36,7 +36,7 @@ from rigidfleet.rigidity import (
 )
 
 #: Maximum number of names in one remark.
-_TOLD = 6
+_MOST_NAMES = 6
 
 
 #: Maximum number of equations for which rigidity, and forces at a step, are computed by a dense decomposition.
@@ -377,7 +377,7 @@ class Preflight(Shown):
         return f"<Preflight: {verdict}, {notes} note{'s' * (notes != 1)}>"
 
     def facts(self) -> Sheet:
-        """The phases, the facts, and the remarks; of a show, nothing that concerns edges."""
+        """The phases, the facts, and the remarks; of a show, nothing of edges, nor of laws that are stable."""
         name, heads = self.mission.name, ("about", "result")
         remarks = [Row((r.level, r.text), r.level) for r in self.remarks]
         verdict = "no problems found" if self.passed else "the flight will fail"
@@ -399,7 +399,8 @@ class Preflight(Shown):
 
     def _tables(self) -> list[FactTable]:
         """Formations and laws, what is said of them in words, and the planned paths."""
-        tables = [] if self.margins is None else [self.margins.table]
+        unstable = any(r.topic == "margins" and r.level == "fails" for r in self.remarks)
+        tables = [self.margins.table] if self.margins and (unstable or not self.is_show) else []
         if self.formations and not self.is_show:
             graphs = _graph_table(self.formations)
             tables = [_formation_table(self.formations), graphs, self.gains.table, *tables]
@@ -459,8 +460,9 @@ class Preflight(Shown):
 
     def _headed_sentences(self) -> Iterator[tuple[str, str]]:
         """What is said in words, each with its heading."""
-        if self.is_show:
-            yield from ((f.name, words) for f in self.formations if (words := _show_notes_text(f)))
+        for f in self.formations if self.is_show else ():
+            if f.colours:
+                yield f.name, f"{f.colours} colour{'s' * (f.colours > 1)} of lights"
         lacking = [p.phase for p in self.planned_phases if p.leg.certificate is None]
         if lacking and self.certificates:
             yield "not proved", f"{names_with_verb(lacking)} flown without tracked slots"
@@ -510,14 +512,6 @@ class Preflight(Shown):
             },
         }
         return to_json_data(data)
-
-
-def _show_notes_text(f: FormationCheck) -> str:
-    """What concerns a formation of a show, besides its spacing."""
-    parts = ["not used in any phase"] if f.held_by == "nothing" else []
-    parts += [f"{f.colours} colour{'s' * (f.colours > 1)} of lights"] if f.colours else []
-    parts += [f"edges solved by {solvers.WORDS[f.solve]}"] if f.solve != "dense" else []
-    return "; ".join(parts)
 
 
 def _formation_table(formations: Sequence[FormationCheck]) -> FactTable:
@@ -588,7 +582,7 @@ def _margin_row(where: str, m: Margins) -> dict[str, Any]:
 
 def names_with_verb(names: Sequence[str]) -> str:
     """First names, the number of the others, and "is" or "are"."""
-    text = first_few([f"'{name}'" for name in names], _TOLD)
+    text = first_few([f"'{name}'" for name in names], _MOST_NAMES)
     return f"{text} {'is' if len(names) == 1 else 'are'}"
 
 

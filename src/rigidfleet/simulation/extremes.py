@@ -40,8 +40,8 @@ _LEAST = 0.1
 _TOUCH, _INSTANT = 1e-6, 1e-6
 #: Greatest rotation of a piece of a step in the body formulation [rad].
 _TURN = 0.1
-#: Agents that are asked for their nearest one, to choose how far the list reaches.
-_ASKED = 2000
+#: Number of agents whose nearest ones are sought, to choose how far the list reaches.
+_SAMPLE = 2000
 #: Vehicles of a crowd: beyond, lists of the pairs near a long step would take hundreds of megabytes.
 _CROWD = 2000
 #: The monitor's number of each quantity that it finds; the clearances at the start and the end belong to the flight.
@@ -327,8 +327,8 @@ class CurveWatch:
         tree = KDTree(x, balanced_tree=False, compact_nodes=False)
         # The nearest pair of some agents is no nearer than that of all: the list is only longer.
         some = np.arange(len(who))
-        if len(who) > _ASKED:
-            some = np.random.default_rng(0).integers(len(who), size=_ASKED)
+        if len(who) > _SAMPLE:
+            some = np.random.default_rng(0).integers(len(who), size=_SAMPLE)
         near, j = tree.query(x[some], k=2)
         # Of two agents at the same place, either may be found as its own nearest one.
         other = np.where(j[:, 1] == some, j[:, 0], j[:, 1])

@@ -183,7 +183,7 @@ class Sweep:
         if isinstance(vary, str | bytes) or not isinstance(vary, Iterable):
             raise wrong_type("a list of variations", vary)
         data = {"mission": mission.name, "vary": list(vary), **keys}
-        variations, header = _Check(data, origin, mission).variations_and_header()
+        variations, header = _SweepDraft(data, origin, mission).variations_and_header()
         ending = "" if header.drill is None else "-drill"
         return cls(mission, variations, header, name or mission.name + ending)
 
@@ -218,7 +218,7 @@ class Sweep:
         if isinstance(own := data.get("vary", []), list):
             data["vary"] = [*own, *more]
         controllers.add_module_folder(path.parent)
-        variations, header = _Check(data, origin, mission).variations_and_header()
+        variations, header = _SweepDraft(data, origin, mission).variations_and_header()
         assert mission is not None  # otherwise the check has raised
         if header.drill:
             drill = header.drill.with_files_in_folder(path.parent)
@@ -426,8 +426,8 @@ def apply_value(
 # -- the check ---------------------------------------------------------------------------------------
 
 
-class _Check:
-    """The check of a sweep: its data, the mission that varies, unless it cannot be read, and what is wrong.
+class _SweepDraft:
+    """A sweep under check: its data, the mission that varies, unless it cannot be read, and what is wrong.
 
     Attributes
     ----------

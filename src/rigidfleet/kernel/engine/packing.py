@@ -119,7 +119,11 @@ _KEPT = 128
 
 
 def _memoise_last(make: Callable[[Any], Any], x: Any) -> Any:
-    """What ``make`` makes of a named tuple, unless it is among the last ones that the thread has used."""
+    """What ``make`` makes of a named tuple, unless it is among the last ones that the thread has used.
+
+    Without it, flights of narrow-passage and moving-obstacles take 1.4 times the processor time, cube-by-neighbours 1.2
+    times, passage-quadrotors 1.1 times. It also keeps words alive while machine code reads them by their address.
+    """
     kept, key = _last.packed, (make, id(x))
     last = kept.pop(key, None)
     if last is None or last[0] is not x:
