@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rigidfleet.assessment import assess
@@ -294,6 +295,30 @@ def test_sweep_page(tmp_path, monkeypatch, capsys):
     from rigidfleet.sweep.variation import KINDS
 
     assert set(kinds) == set(KINDS)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_job_arrays_of_the_pages_have_work(path):
+    """Each shard of a job array has a group of runs for each of its cores; the page has such an array if it has any."""
+    from rigidfleet.sweep import Sweep
+    from rigidfleet.sweep.run import GROUP
+    from rigidfleet.sweep.shards import runs_of_shard
+
+    text = path.read_text(encoding="utf-8")
+    arrays = re.findall(
+        r"--array=1-(\d+) --cpus-per-task=(\d+) .*?sweep (\S+) (?:--runs (\d+) )?--shard \S+/(\d+)'",
+        text,
+        re.DOTALL,
+    )
+    assert len(arrays) == text.count("sbatch ")
+    for machines, cores, file, runs, shards in arrays:
+        assert machines == shards
+        count = Sweep.load(ROOT / file, runs=int(runs) if runs else None).runs
+        for k in range(1, int(shards) + 1):
+            groups = np.unique(np.flatnonzero(runs_of_shard(f"{k}/{shards}", count)) // GROUP)
+            assert len(groups) >= int(cores)
+    again = re.findall(r"sweep sweeps/\S+ --shard \d+/(\d+)", text)
+    assert set(again) <= {shards for *_, shards in arrays}
 
 
 # -- paper.md ----------------------------------------------------------------------------------------

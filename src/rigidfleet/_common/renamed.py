@@ -59,6 +59,5 @@ def _current_member(owner: Any, new: Mapping[str, str], old: str, level: int = 2
     """A member of an object, a class or a module by its earlier name, with a warning where it is used."""
     if old not in new:
         raise AttributeError(f"module {owner.__name__!r} has no attribute {old!r}")
-    member = getattr(owner, new[old])
     warnings.warn(f"{old} is now {new[old]}", DeprecationWarning, stacklevel=level)
-    return member
+    return getattr(owner, new[old])

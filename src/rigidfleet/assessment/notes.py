@@ -152,8 +152,7 @@ def _negative_height_notes(measured: Measurements) -> Iterator[str]:
     if e is not None and e.value < -DIP:
         low = np.flatnonzero((sampled.values < -DIP).any(axis=0))
         others = f" ({agent_names(low)} are below 0 at times)" if len(low) > 1 else ""
-        words = f"dips to z = {e.value:.2f} m at {e.when:.2f} s{others}"
-        yield f"{e.who} {words}; the mission has no ground there"
+        yield f"{e.who} dips to z = {e.value:.2f} m at {e.when:.2f} s{others}; the mission has no ground there"
 
 
 def _formation_flip_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
