@@ -1353,7 +1353,9 @@ def test_the_command_flies_shards(folder, capsys):
     for words, tokens in wrong.items():
         assert cli.main(tokens) == codes.BAD_INPUT
         assert words in capsys.readouterr().err
-    with pytest.warns(UserWarning, match="nothing to fly; 20 runs, .* up to 3"):  # a job array goes on
+    with pytest.warns(
+        UserWarning, match="nothing to fly; 20 runs, .* up to 3"
+    ):  # a job array goes on
         assert cli.main([*line, "--shard", "4/5", "--out", "idle"]) == codes.PASSED
     assert cli.main(["sweep", "sweeps/pair", "--shard", "1/2", "--quiet"]) == codes.PASSED
     assert cli.main(["sweep", "sweeps/pair", "--merge", "--json"]) == codes.PASSED
