@@ -546,7 +546,7 @@ def test_below_ground_level_is_noted_where_there_is_no_ground():
     verdict = assess(flown(a_mission(TRIANGLE, 3), path))
     assert verdict.passed
     assert other_notes(verdict) == [
-        "agent 2 dips to z = -0.60 m at 5.00 s; the mission has no ground"
+        "agent 2 dips to z = -0.60 m at 5.00 s; the mission has no ground there"
     ]
     assert (
         "agents 1, 2 and 3 are below"
@@ -559,6 +559,38 @@ def test_below_ground_level_is_noted_where_there_is_no_ground():
     ground = assess(flown(a_mission(TRIANGLE, 3, obstacles=[{"kind": "ground"}]), path))
     assert other_notes(ground) == []
     assert failures(ground) == {"clearance"}
+
+
+FAR = {"min": [60, -90, -12], "max": [90, 90, -9]}
+TERRAIN = {"kind": "heights", "spacing": 90.0, "heights": [[-9.0, -9.0], [-9.0, -9.0]]}
+
+
+@pytest.mark.parametrize(
+    ("below", "noted"),
+    [
+        ({"kind": "ground", "height": -9.0}, []),
+        ({"kind": "box", "min": [-90, -90, -12], "max": [90, 90, -9]}, []),
+        ({"kind": "box", "min": [-90, -90, -12], "max": [90, 90, -9], "yaw_deg": 9.0}, []),
+        (TERRAIN | {"corner": [-45, -45]}, []),
+        (TERRAIN | {"corner": [60, -45]}, [1, 2]),
+        ({"kind": "box"} | FAR, [1, 2]),
+        ({"kind": "box", "zone": True, "min": [-90, -90, -12], "max": [90, 90, -9]}, [1, 2]),
+        ({"kind": "sphere", "centre": [0, 0, -20], "radius": 9.0}, [1, 2]),
+        # Agent 1 is over it, and dips lower.
+        ({"kind": "box", "min": [-8, -90, -12], "max": [0, 90, -9]}, [2]),
+    ],
+    ids=["ground", "roof", "turned", "terrain", "ends before", "beside", "zone", "sphere", "one"],
+)
+def test_ground_is_whatever_is_below(below, noted):
+    """Agents below z = 0 are noted where neither ground, terrain nor roof is below them, and no others."""
+    mission = a_mission(TRIANGLE, 3, obstacles=[below])
+    high = np.array([[-4.0, 0, 9], [4.0, 0, 9], [9.0, 0, 9]])
+    low = high - [[0, 0, 11], [0, 0, 9.6], [0, 0, 0]]
+    notes = other_notes(assess(flown(mission, [high, low, high])))
+    lowest = {1: "agent 1 dips to z = -2.00 m", 2: "agent 2 dips to z = -0.60 m"}
+    others = " (agents 1 and 2 are below 0 at times)" if len(noted) > 1 else ""
+    words = [f"{lowest[i]} at 5.00 s{others}; the mission has no ground there" for i in noted[:1]]
+    assert [note for note in notes if "ground" in note] == words
 
 
 @pytest.mark.parametrize("height", [0.26, 0.24])

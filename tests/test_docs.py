@@ -2,16 +2,19 @@
 
 import ast
 import builtins
+import fnmatch
 import importlib
 import importlib.util
 import itertools
 import re
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rigidfleet.assessment import assess
@@ -296,6 +299,30 @@ def test_sweep_page(tmp_path, monkeypatch, capsys):
     assert set(kinds) == set(KINDS)
 
 
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_job_arrays_of_the_pages_have_work(path):
+    """Each shard of a job array has a group of runs for each of its cores; the page has such an array if it has any."""
+    from rigidfleet.sweep import Sweep
+    from rigidfleet.sweep.run import GROUP
+    from rigidfleet.sweep.shards import runs_of_shard
+
+    text = path.read_text(encoding="utf-8")
+    arrays = re.findall(
+        r"--array=1-(\d+) --cpus-per-task=(\d+) .*?sweep (\S+) (?:--runs (\d+) )?--shard \S+/(\d+)'",
+        text,
+        re.DOTALL,
+    )
+    assert len(arrays) == text.count("sbatch ")
+    for machines, cores, file, runs, shards in arrays:
+        assert machines == shards
+        count = Sweep.load(ROOT / file, runs=int(runs) if runs else None).runs
+        for k in range(1, int(shards) + 1):
+            groups = np.unique(np.flatnonzero(runs_of_shard(f"{k}/{shards}", count)) // GROUP)
+            assert len(groups) >= int(cores)
+    again = re.findall(r"sweep sweeps/\S+ --shard \d+/(\d+)", text)
+    assert set(again) <= {shards for *_, shards in arrays}
+
+
 # -- paper.md ----------------------------------------------------------------------------------------
 
 
@@ -408,6 +435,55 @@ def test_functions_exist(name):
         for part in parts[k:]:
             found = getattr(found, part, None)
             assert found is not None, f"{name} names {dotted}"
+
+
+@cache
+def names_in(folder: Path) -> set[str]:
+    """Names of a folder and the modules below it, and of what they define: functions, classes, constants, fields."""
+    names = set()
+    for path in folder.rglob("*.py"):
+        names |= {*path.relative_to(folder.parent).with_suffix("").parts}
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                names.add(node.name)
+            for part in node.body if isinstance(node, ast.Module | ast.ClassDef) else ():
+                assigned = part.targets if isinstance(part, ast.Assign) else [part]
+                targets = [getattr(x, "target", x) for x in assigned]
+                names |= {x.id for t in targets for x in ast.walk(t) if isinstance(x, ast.Name)}
+    return names
+
+
+#: Names of the pages on the code that the package does not define: a mark of pytest, a variable of Python.
+NOT_OURS = {"long", "PYTHONSAFEPATH"}
+
+
+@pytest.mark.parametrize(
+    "path", [ROOT / "CONTRIBUTING.md", ROOT / "docs" / "design.md"], ids=lambda path: path.stem
+)
+def test_names_of_the_code_exist(path):
+    """Each name, dotted or not, and each file that the pages on the code name is there, in the package of its row."""
+    text = re.sub(
+        r"^```.*?^```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
+    )
+    source, spans = ROOT / "src" / "rigidfleet", re.compile(r"`([^`\n]+)`")
+    there = names_in(source)
+    named = [x for x in spans.findall(text) if re.fullmatch(r"[\w*]+(\.\w+)*", x)]
+    files = [x for x in spans.findall(text) if re.fullmatch(r"[\w./]+\.(py|toml|txt)", x)]
+    assert len(named) > 20
+    assert len(files) > 5
+    for name in {*named} - {*files} - NOT_OURS:
+        for part in name.split("."):
+            word = f"*{part}" if part.startswith("_") else part  # `_deg` ends the names of keys
+            assert fnmatch.filter(there, word), f"{path.name} names {name}"
+    known = {f"/{x.relative_to(ROOT).as_posix()}" for x in ROOT.glob("*.*")}
+    for folder in ("src", "tests", "docs", "examples", "benchmarks"):
+        known |= {f"/{x.relative_to(ROOT).as_posix()}" for x in (ROOT / folder).rglob("*.*")}
+    for file in files:
+        assert any(x.endswith(f"/{file}") for x in known), f"{path.name} names {file}"
+    for package, row in re.findall(r"^\| `(\w+)` \| ([^|]+) \|", text, re.MULTILINE):
+        if (source / package).is_dir():
+            own = {x for x in spans.findall(row) if re.fullmatch(r"\w+", x)}
+            assert own <= names_in(source / package), package
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)

@@ -88,6 +88,11 @@ def test_the_lowest_versions_are_those_declared():
         assert all(version in need.specifier for version in pinned[name]), need
 
 
+def test_other_versions_fly_with_all_extras():
+    """Each extra that is declared is installed with the other versions of packages and of Python that CI flies."""
+    assert Requirement(f"rigidfleet{versions.EXTRAS}").extras == {*PROJECT["optional-dependencies"]}
+
+
 @cache
 def nodes() -> list[ast.AST]:
     """Every import, call and argument in the package."""

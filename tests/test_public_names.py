@@ -5,7 +5,9 @@ import inspect
 import json
 import lzma
 import re
+import warnings
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +66,23 @@ def test_public_names_stay(name):
     if fields is not None:
         missing = {f"{name}.{x}" for x in set(fields) - members(thing)}
         assert missing <= GONE.keys()
+
+
+@pytest.mark.parametrize("name", sorted(PUBLIC["members of classes"].keys() - GONE.keys()))
+def test_members_of_classes_stay(name):
+    """A value or a function that a class has without an object is there; by an earlier name, with a warning here."""
+    kind = there(name)
+    for member in PUBLIC["members of classes"][name]:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            value = getattr(kind, member)
+        assert not isinstance(value, property | cached_property), f"{name}.{member}"
+        if isinstance(inspect.getattr_static(kind, member), property):  # an earlier name
+            (warning,) = caught
+            new = re.fullmatch(rf"{member} is now (\w+)", str(warning.message))
+            assert new, f"{name}.{member}"
+            assert value == getattr(kind, new[1])
+            assert warning.filename == __file__
 
 
 def test_variables_metrics_and_exit_codes_stay():

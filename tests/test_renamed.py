@@ -11,6 +11,9 @@ from rigidfleet.cli import codes
 from rigidfleet.errors import MissionError, ResultError, SweepError
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, draft, load_mission
+from rigidfleet.mission.kinds import Fly, Follow
+from rigidfleet.result import Result
+from rigidfleet.rigidity import Realisation
 from rigidfleet.sweep import Sweep, store
 from rigidfleet.sweep.runner import fly
 
@@ -121,7 +124,12 @@ def test_earlier_names_of_members_and_functions_work_and_warn():
         (mission, "linked", mission.has_link),
         (lqr, "led", lqr.trajectory_of_response),
         (draft, "aligned", draft.align_comments),
+        (Fly, "led", False),
+        (Follow, "led", True),
+        (Result, "evaluate", Result.compute_lazy_values),
     ):
-        with pytest.warns(DeprecationWarning, match=f"{old} is now"):
+        with pytest.warns(DeprecationWarning, match=f"{old} is now") as warned:
             assert getattr(thing, old) == new
+        assert warned[0].filename == __file__  # Python shows those of the user's own program alone
     assert not hasattr(lqr, "no_such_function")
+    assert not hasattr(Realisation, "found")  # a field without a default, which only objects have

@@ -17,6 +17,7 @@ change that is being tested. A Python that is not here is named, and nothing is 
 
 from __future__ import annotations
 
+import lzma
 import os
 import platform
 import shutil
@@ -25,6 +26,7 @@ import sys
 import tarfile
 import tempfile
 import time
+import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
@@ -34,7 +36,8 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 #: Versions of Python that are looked for, the oldest first.
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
-EXTRAS = "[analysis,cluster,show,mcap,rerun]"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+EXTRAS = f"[{','.join(PROJECT['optional-dependencies'])}]"
 PINS = ("--build-constraints", "constraints.txt")
 #: Environments that fly at a time.
 AT_A_TIME = 2
@@ -54,9 +57,15 @@ COMMANDS = (
 DRAWING = (
     '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><path d="M1 1C3 9 6 9 8 1Z"/></svg>'
 )
-#: The same in Python: a sweep by a cluster, and what xarray sees of it and of a flight.
+#: Logs of autopilots, which packages of the extra `logs` read.
+LOGS = ("plane.bin", "cube.ulg")
+#: The same in Python: a sweep by a cluster, and what xarray sees of it and of a flight; logs; a step of learning.
 SCRIPT = """
-import distributed, xarray
+from pathlib import Path
+
+import distributed, xarray, zstandard
+from rigidfleet.foreign.files import read_trajectories
+from rigidfleet.simulation.environment import FormationEnv
 from rigidfleet.sweep import Sweep, fly, load
 
 if __name__ == "__main__":
@@ -67,6 +76,11 @@ if __name__ == "__main__":
     assert load("here").drop_vars("wall").equals(load("there").drop_vars("wall"))
     with xarray.open_dataset("flown/narrow-passage.nc", engine="h5netcdf") as flight:
         assert flight.sizes["agent"] == 3
+    for log in ("plane.bin", "cube.ulg", "flown/narrow-passage.mcap"):
+        assert read_trajectories(Path(log)).curves
+    env = FormationEnv("cube-by-neighbours")
+    env.reset(seed=1)
+    assert len(env.step({name: env.action_space(name).sample() for name in env.agents})[1]) == 8
 """
 
 
@@ -151,6 +165,9 @@ def fly(python: Path, folder: Path) -> None:
     """Fly in an environment, with nothing compiled before."""
     (folder / "drawing.svg").write_text(DRAWING, encoding="utf-8")
     (folder / "script.py").write_text(SCRIPT, encoding="utf-8")
+    for log in LOGS:
+        packed = (ROOT / "tests" / "data" / "logs" / f"{log}.xz").read_bytes()
+        (folder / log).write_bytes(lzma.decompress(packed))
     commands = [("-m", "rigidfleet", *command.split()) for command in COMMANDS]
     for command in (*commands, ("script.py",)):
         run(python, *command, cwd=folder, NUMBA_CACHE_DIR=str(folder / "cache"))

@@ -32,12 +32,19 @@ def rename_hint(key: object, value: object = None) -> str:
     return f"it is now called '{new}'" if new is not None else ""
 
 
+class _EarlierMember(property):
+    """A member by its earlier name, of the class as of its objects."""
+
+    def __get__(self, thing: Any, kind: type | None = None) -> Any:
+        return super().__get__(kind if thing is None else thing)
+
+
 def with_earlier_members(**new: str) -> Callable[[_C], _C]:
     """Give a class its members by earlier names, too: each with the name of now."""
 
     def add_properties(kind: _C) -> _C:
         for old in new:
-            setattr(kind, old, property(partial(_current_member, new=new, old=old)))
+            setattr(kind, old, _EarlierMember(partial(_current_member, new=new, old=old, level=3)))
         return kind
 
     return add_properties
@@ -48,9 +55,9 @@ def getattr_of_earlier_names(module: str, **new: str) -> Callable[[str], Any]:
     return partial(_current_member, sys.modules[module], new)
 
 
-def _current_member(owner: Any, new: Mapping[str, str], old: str) -> Any:
-    """A member of a class or a module by its earlier name, with a warning."""
+def _current_member(owner: Any, new: Mapping[str, str], old: str, level: int = 2) -> Any:
+    """A member of an object, a class or a module by its earlier name, with a warning where it is used."""
     if old not in new:
         raise AttributeError(f"module {owner.__name__!r} has no attribute {old!r}")
-    warnings.warn(f"{old} is now {new[old]}", DeprecationWarning, stacklevel=2)
+    warnings.warn(f"{old} is now {new[old]}", DeprecationWarning, stacklevel=level)
     return getattr(owner, new[old])

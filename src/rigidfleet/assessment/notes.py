@@ -12,6 +12,7 @@ from rigidfleet.assessment.checks import abandonment_check
 from rigidfleet.assessment.fits import degrees_between
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import DIP, FLIPPED, PhaseVerdict, value
+from rigidfleet.result.quantities import Samples
 
 #: A speed [m/s] and an extent [m] from which units are doubted.
 _FAST, _WIDE = 100.0, 20_000.0
@@ -140,19 +141,18 @@ def _fall_notes(measured: Measurements) -> Iterator[str]:
 
 
 def _negative_height_notes(measured: Measurements) -> Iterator[str]:
-    """Note agents below z = 0 if the mission has neither a ground nor a geofence."""
-    mission = measured.mission
-    if mission.limits.geofence is not None or any(
-        o.kind in ("ground", "heights") for o in mission.obstacles
-    ):
+    """Note agents below z = 0 that have nothing to stand on below them, if the mission has no geofence."""
+    mission, e = measured.mission, measured.worst("lowest")
+    if mission.limits.geofence is not None or e is None or e.value >= -DIP:
         return
-    e = measured.worst("lowest")
+    sampled, r = measured.samples_of("lowest"), np.moveaxis(measured.result.position, 2, 0)
+    if (over := np.isfinite(mission.height_below(*r))).any():  # what is worst may be over ground
+        sampled = Samples(sampled.quantity, np.where(over, np.nan, sampled.values))
+        e = measured.worst_sample(sampled)
     if e is not None and e.value < -DIP:
-        z = measured.samples_of("lowest").values
-        low = np.flatnonzero((z < -DIP).any(axis=0))
+        low = np.flatnonzero((sampled.values < -DIP).any(axis=0))
         others = f" ({agent_names(low)} are below 0 at times)" if len(low) > 1 else ""
-        words = f"dips to z = {e.value:.2f} m at {e.when:.2f} s{others}"
-        yield f"{e.who} {words}; the mission has no ground"
+        yield f"{e.who} dips to z = {e.value:.2f} m at {e.when:.2f} s{others}; the mission has no ground there"
 
 
 def _formation_flip_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:

@@ -29,7 +29,7 @@ SLACK = 1e-9
 TOUCH_DOWN = 0.5
 #: Angle beyond which a plane's normal, or a line's direction, counts as flipped [deg].
 FLIPPED = 90.0
-#: Depth below z = 0 from which an agent is noted if the mission has no ground [m].
+#: Depth below z = 0 from which an agent is noted if the mission has no ground there [m].
 DIP = 0.01
 #: Checks that say nothing of a flight without edges.
 _OF_EDGES = {"constraint", "constraint_force", "tension", "singular_value"}

@@ -37,8 +37,6 @@ class Settle(Part):
     ended="keys_if_ended",
     automatic="auto_keys",
     angles="angles_in_words",
-    free="has_free_velocity",
-    place="rest_position",
     meets="commanded_at_arrival",
     bent="has_bent_ways",
 )
@@ -433,7 +431,7 @@ class Brake(Arriving):
     kind: Literal["brake"] = required_key("come to rest where braking leads")
 
 
-@with_earlier_members(meets="commanded_at_arrival", each="has_way_per_vehicle")
+@with_earlier_members(each="has_way_per_vehicle")
 class Vertical(Arriving):
     """A phase that leads vehicles straight up or down: all together, some of them, or one group after another."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
@@ -86,7 +87,8 @@ def fly(
     workers : number of processes on this machine; default: number of cores. Work of a few seconds is done in this
         process. A script that starts processes needs `if __name__ == "__main__":`
     cluster : address of a Dask scheduler, whose workers fly the runs
-    shard : "3/40": fly only the third of forty parts, into a store of its own in the folder; `merge` makes one store
+    shard : "3/40": fly only the third of forty parts, into a store of its own in the folder; `merge` makes one store.
+        Groups of eight runs stay together: a part without one is warned of
     replace : overwrite a sweep that is in the folder
     progress : called after each chunk, and each second at least
     pool : an executor of `concurrent.futures` whose workers, as many as ``workers`` says, fly the runs; it stays open
@@ -104,6 +106,9 @@ def fly(
     if not isinstance(pool, Executor | None):
         raise wrong_type("an Executor of concurrent.futures as pool", pool)
     own, folder = runs_of_shard(shard, sweep.runs), shard_folder(Path(folder), shard)
+    if not own.any():
+        words = f"{sweep.runs} runs, in groups of {GROUP}, are enough for K/N with N up to {-(-sweep.runs // GROUP)}"
+        warnings.warn(f"--shard {shard}: nothing to fly; {words}.", stacklevel=2)
     count = usable_core_count() if workers is None else workers
     with Store(folder, sweep, shard, replace) as store:
         flight = _Sweeping(sweep, store, progress, own)
@@ -194,9 +199,8 @@ class _Sweeping:
         """Runs of the next chunk: complete groups for the duration of a chunk."""
         fair = -(-len(self.missing) // (_AHEAD * workers))
         groups = 1 if self.pace == 0.0 else min(fair, int(_CHUNK / (self.pace * GROUP)))
-        first = [self.missing.popleft() for _ in range(max(1, groups))]
-        last = self.sweep.runs
-        return [run for g in first for run in range(g * GROUP, min((g + 1) * GROUP, last))]
+        first = [GROUP * self.missing.popleft() for _ in range(max(1, groups))]
+        return [run for k in first for run in range(k, min(k + GROUP, self.sweep.runs))]
 
     def store_records(self, rows: list[RunRecord]) -> None:
         """Store the records of a chunk."""
