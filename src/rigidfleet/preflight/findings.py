@@ -417,9 +417,9 @@ class Preflight(Shown):
             places |= {f"'{f.name}'": f.spacing_m for f in self.formations}
             for where, apart in places.items():
                 yield Fact("spacing, centre to centre", apart, "m", who=where)
-        for name, worst in self.worst.items():
-            if worst is not None:
-                q, (value, t, who, limit) = QUANTITIES[name], worst
+        for name, q in QUANTITIES.items():
+            if (worst := self.worst.get(name)) is not None:
+                value, t, who, limit = worst
                 yield Fact(q.name_in_words, value, q.unit, limit, q.at_least, t, who)
         if certificates := self.certificates:
             phase, least = min(certificates.items(), key=lambda item: item[1].separation)

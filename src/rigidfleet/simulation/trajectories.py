@@ -114,7 +114,8 @@ def trajectories(
     Raises
     ------
     ResultError
-        The arrays are no trajectories: a wrong shape, values that are not finite, times that do not increase.
+        The arrays are no trajectories: a wrong shape, values that are not finite, times that do not increase. Or
+        positions over time do not show what a limit is of.
     MissionError
         A limit is invalid.
     """
@@ -205,7 +206,7 @@ def judging_mission(
     MissionError
         A limit is invalid.
     ResultError
-        The mission has another number of vehicles.
+        The mission has another number of vehicles, or positions over time do not show what a limit is of.
     """
     lasting = max(duration, 1e-3)
     phase = {"kind": "hold", "name": PHASE, "control": "open", "duration": lasting}
