@@ -1,10 +1,11 @@
-"""A made-up limit of constraint forces is judged or refused, has its metric, its row, its line and its documented key."""
+"""A made-up limit of constraint forces is judged or refused, and has its metric, row, line in a figure, and key."""
 
 import importlib
 import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from matplotlib.text import Text
 
 import rigidfleet as rf
@@ -43,12 +44,8 @@ assert "constraint_force" not in paths
 # Of curves that others made nobody knows forces: the limit is not offered, is refused, and one of a mission left out.
 time, places = np.linspace(0.0, 4.0, 41), np.zeros((41, 3, 3)) + [[0.0], [2.0], [4.0]]
 assert "constraint_force" not in assess_command._LIMITS
-try:
+with pytest.raises(ResultError, match=r"limits\.constraint_force: is judged by forces"):
     rf.trajectories(time, places, limits={"constraint_force": 1.0})
-except ResultError as error:
-    assert "limits.constraint_force: is judged by forces" in str(error)
-else:
-    raise AssertionError("a limit that nobody can judge is taken")
 verdict = rf.assess(rf.trajectories(time, places, mission=limited))
 assert not [c for c in verdict.checks if c.check == "constraint_force"]
 
