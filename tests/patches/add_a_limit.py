@@ -51,7 +51,9 @@ assert not [c for c in verdict.checks if c.check == "constraint_force"]
 
 (picture,) = plotting.plot(result, names=["constraint_force"])
 drawn = [text.get_text() for text in picture.findobj(Text)]
-assert any(f"limit {0.5 * greatest:g} N" in text.replace("\N{NO-BREAK SPACE}", " ") for text in drawn)
+assert any(
+    f"limit {0.5 * greatest:g} N" in text.replace("\N{NO-BREAK SPACE}", " ") for text in drawn
+)
 assert report_page(result).count('class="words">constraint force') == 2
 assert METRICS["constraint_force"].unit == "N"
 assert json_schema()["$defs"]["Limits"]["properties"]["constraint_force"]["description"]
