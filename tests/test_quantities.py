@@ -1,9 +1,11 @@
 """A quantity with its limit is one entry: whoever reads limits finds each one that a flight fails by."""
 
+import json
 import math
 import re
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -16,11 +18,14 @@ import rigidfleet as rf
 from rigidfleet import plotting
 from rigidfleet._common.quantities import MOTIONS, QUANTITIES
 from rigidfleet.assessment import Verdict, safety
+from rigidfleet.assessment.checks import _quantity_check
+from rigidfleet.assessment.measure import Measurements
 from rigidfleet.cli import app as cli
+from rigidfleet.errors import RigidfleetError
 from rigidfleet.mission import json_schema
 from rigidfleet.mission.schema import Limits
 from rigidfleet.preflight.findings import Preflight
-from rigidfleet.reporting import report_page
+from rigidfleet.reporting import overlay, report_page
 from rigidfleet.result import Result
 from rigidfleet.simulation.flight import simulate
 from rigidfleet.sweep import METRICS, Sweep, read
@@ -76,6 +81,15 @@ BROKEN: dict[str, tuple[str, dict[str, Any], str, str]] = {
 }  # fmt: skip
 
 
+#: Keys of limits that nobody can judge by positions over time.
+NOT_OF_CURVES = {
+    "jerk", "horizontal_jerk", "vertical_jerk", "tilt_deg", "separation_allowance", "people", "saturation",
+    "tracking_error",
+}  # fmt: skip
+#: Keys that `assess` has as an option of its own, or that are no numbers.
+OTHERWISE = {"separation", "separation_altitude", "geofence"}
+
+
 @cache
 def flown(key: str) -> tuple[Result, Verdict, Preflight]:
     """A flight that fails by a limit, judged, and its mission, checked."""
@@ -84,10 +98,20 @@ def flown(key: str) -> tuple[Result, Verdict, Preflight]:
     return result, rf.assess(result), rf.check(mission)
 
 
-def help_of_assess(capsys: pytest.CaptureFixture[str]) -> str:
-    """What `rigidfleet assess --help` prints."""
+def curves(limits: dict[str, Any], *, cubic: bool = True) -> Result:
+    """Three curves that others made, one below another, which no limit of `BROKEN` allows."""
+    t = np.linspace(0.0, 10.0, 101)
+    x = np.stack([4.0 * np.sin(t), 3.0 * np.cos(t), 5.0 + 3.0 * np.sin(2.0 * t)], axis=1)
+    starts = np.array(STACKED["position"])
+    return rf.trajectories(t, x[:, None] + starts, cubic=cubic, radius=0.25, limits=limits)
+
+
+def limits_in_help_of_assess(capsys: pytest.CaptureFixture[str]) -> set[str]:
+    """The keys of limits that `rigidfleet assess --help` offers."""
     cli.main(["assess", "--help"])
-    return capsys.readouterr().out
+    words = " ".join(re.findall(r"[\w.,:=]+", capsys.readouterr().out))
+    (offered,) = re.findall(r"KEY=VALUE, may be repeated: ([\w, ]+)\.", words)
+    return set(offered.split(", "))
 
 
 def test_every_limit_is_one_of_a_quantity():
@@ -125,9 +149,66 @@ def test_a_limit_that_a_flight_fails_by_is_in_all_readers(key, capsys):
     assert row.margin == pytest.approx(-abs(check.worst - check.limit))
     words = json_schema()["$defs"]["Limits"]["properties"]
     assert key == "thrust_limit" or words[key]["description"]
-    judged_of_curves = q.monitored and q.key == f"limits.{key}" and key != "geofence"
-    if judged_of_curves:
-        assert key in help_of_assess(capsys)
+    offered = Limits.model_fields.keys() - NOT_OF_CURVES - OTHERWISE
+    assert (key in limits_in_help_of_assess(capsys)) == (key in offered)
+
+
+@pytest.mark.parametrize("key", [key for key in BROKEN if QUANTITIES[BROKEN[key][0]].order])
+def test_a_check_lists_the_planned_motion_with_its_limit(key):
+    """Console, notebook and JSON have each motion that is limited: planned, beyond its limit, as it is flown."""
+    name = BROKEN[key][0]
+    _, verdict, before = flown(key)
+    q = QUANTITIES[name]
+    (check,) = [c for c in verdict.checks if c.check == name]
+    entry = json.loads(json.dumps(before.data()))["paths"][name]
+    ((_, worst), *_, (unit, limit)) = entry.items()
+    in_keys = {"m/s": "m_s", "m/s^2": "m_s2", "m/s^3": "m_s3", "deg": "deg", "N": "n"}
+    assert unit == f"limit_{in_keys[q.unit]}"
+    assert limit == check.limit < worst
+    assert worst == pytest.approx(check.worst, rel=0.1)  # as it is flown, but for errors of control
+    (row,) = [words for heading, words in before.describe() if heading == q.name_in_words]
+    assert f"limit <= {limit:g} {q.unit}," in row
+    cells = re.findall(r"<td[^>]*>([^<]*)</td>", before._repr_html_())
+    k = cells.index(q.name_in_words)
+    assert cells[k + 2] == f"&lt;= {limit:g} {q.unit}"
+
+
+def test_a_check_lists_the_separation_with_its_limit():
+    """In JSON, too."""
+    assert flown("separation")[2].data()["paths"]["separation"]["limit_m"] == 5.0
+
+
+@pytest.mark.parametrize("cubic", [True, False])
+@pytest.mark.parametrize("key", Limits.model_fields)
+def test_a_limit_of_curves_is_judged_or_refused(key, cubic):
+    """Each limit fails a curve that breaks it, or is refused with the reason; none is passed by silently."""
+    limits = BROKEN[key][1]["limits"]
+    if key in NOT_OF_CURVES:
+        with pytest.raises(RigidfleetError, match=key):
+            curves(limits, cubic=cubic)
+        return
+    verdict = rf.assess(curves(limits, cubic=cubic))
+    (check,) = [c for c in verdict.checks if c.check == BROKEN[key][0]]
+    assert not check.passed
+    assert not verdict.passed
+    assert check.judged
+
+
+def test_a_quantity_of_curves_that_nobody_measures_does_not_pass():
+    """A limit that was let through without anything that measures it fails, and says why."""
+    q = replace(QUANTITIES["constraint_force"], key="limits.speed")
+    (check,) = _quantity_check(Measurements(curves({"speed": 99.0})), q)
+    assert not check.passed
+    assert "positions over time do not show it" in check.message
+
+
+@pytest.mark.parametrize("key", ["speed", "thrust_limit", "tracking_error", "separation"])
+def test_figures_of_several_flights_have_the_limits(key):
+    """Where flights lie over each other, each limit that one of them has is drawn, once."""
+    result, verdict, _ = flown(key)
+    (check,) = [c for c in verdict.checks if c.check == BROKEN[key][0]]
+    picture = overlay.svg_of_time_curves([result, result], ["one", "two"]).decode()
+    assert picture.count(f"limit {check.limit:g} {check.unit}") == 1
 
 
 @pytest.mark.long
@@ -194,7 +275,9 @@ def test_the_tilt_of_points_is_that_of_the_thrust_that_slots_need():
     angle = np.degrees(np.arctan2(np.hypot(force[..., 0], force[..., 1]), force[..., 2]))
     assert check.worst == pytest.approx(np.nanmax(angle), rel=1e-9)
     assert not check.passed
-    assert not rf.check(mission).passed
+    before = rf.check(mission)
+    assert not before.passed
+    assert before.worst["tilt"][0] == pytest.approx(np.nanmax(angle), rel=1e-3)
 
 
 def test_a_collision_with_a_lost_vehicle_is_judged_without_its_first_contact():

@@ -1,13 +1,18 @@
-"""A made-up limit of constraint forces is judged, has its metric, its row on the page, and its key in the document."""
+"""A made-up limit of constraint forces is judged or refused, and has its metric, row, line in a figure, and key."""
 
 import importlib
 import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
+from matplotlib.text import Text
 
 import rigidfleet as rf
+from rigidfleet import plotting
 from rigidfleet.assessment import safety
+from rigidfleet.cli import assess as assess_command
+from rigidfleet.errors import ResultError
 from rigidfleet.mission import json_schema
 from rigidfleet.reporting import report_page
 from rigidfleet.sweep import METRICS
@@ -31,6 +36,24 @@ for limit, passes in ((1.01 * greatest, True), (0.5 * greatest, False)):
     assert row.margin is not None
     assert (row.margin > 0.0) == passes
 
+# The check lists what is planned with its limit, and no forces, which no plan has.
+limited = rf.Mission.from_dict(base | {"limits": {"constraint_force": 1.0, "speed": 0.5}})
+paths = rf.check(limited).data()["paths"]
+assert paths["speed"]["limit_m_s"] == 0.5
+assert "constraint_force" not in paths
+# Of curves that others made nobody knows forces: the limit is not offered, is refused, and one of a mission left out.
+time, places = np.linspace(0.0, 4.0, 41), np.zeros((41, 3, 3)) + [[0.0], [2.0], [4.0]]
+assert "constraint_force" not in assess_command._LIMITS
+with pytest.raises(ResultError, match=r"limits\.constraint_force: is judged by forces"):
+    rf.trajectories(time, places, limits={"constraint_force": 1.0})
+verdict = rf.assess(rf.trajectories(time, places, mission=limited))
+assert not [c for c in verdict.checks if c.check == "constraint_force"]
+
+(picture,) = plotting.plot(result, names=["constraint_force"])
+drawn = [text.get_text() for text in picture.findobj(Text)]
+assert any(
+    f"limit {0.5 * greatest:g} N" in text.replace("\N{NO-BREAK SPACE}", " ") for text in drawn
+)
 assert report_page(result).count('class="words">constraint force') == 2
 assert METRICS["constraint_force"].unit == "N"
 assert json_schema()["$defs"]["Limits"]["properties"]["constraint_force"]["description"]

@@ -226,7 +226,7 @@ class Fact(NamedTuple):
     @property
     def bound(self) -> str:
         """The limit with its sense: ">= 0.2 m"; "" if there is none."""
-        if self.limit is None:
+        if self.limit in (None, float("inf")):
             return ""
         sign = (">=" if self.limit else ">") if self.at_least else "<="
         return f"{sign} {value(self.limit, self.unit)}"

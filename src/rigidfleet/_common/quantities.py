@@ -37,6 +37,7 @@ class Quantity:
     scale : factor from values in records to `unit`
     words : about the worst value; "" for "greatest speed 3 m/s, agent 1, at 2.00 s (limit 4 m/s)"
     nothing : words if there is nothing to judge; "" for "the flight has no speed to judge"
+    source : what it is judged by where positions over time do not show it, such as "forces"; "" if they do
     monitored : whether the kernel's monitor finds it in continuous time
     by_phase : whether a verdict has its worst value for each phase
     checked : whether a verdict checks or reports it, and a sweep keeps it
@@ -54,6 +55,7 @@ class Quantity:
     scale: float = 1.0
     words: str = ""
     nothing: str = ""
+    source: str = ""
     monitored: bool = True
     by_phase: bool = False
     checked: bool = True
@@ -90,7 +92,7 @@ def _motion_quantity(order: int, way: str, what: str, unit: str) -> Quantity:
     nothing = "" if order < 3 else "no slots are tracked"
     return Quantity(
         name, unit, f"{text}, if it is limited" if way else text, key=f"limits.{name}", order=order, way=way,
-        nothing=nothing, monitored=order < 3, by_phase=order < 3 and not way,
+        nothing=nothing, source="" if order < 3 else "a plan", monitored=order < 3, by_phase=order < 3 and not way,
     )  # fmt: skip
 
 
@@ -109,7 +111,7 @@ QUANTITIES: dict[str, Quantity] = {
         ),
         Quantity(
             "separation_as_planned", "m", "greatest distance by which vehicles come nearer than a phase's plan proves",
-            "pair", key="limits.separation_allowance", monitored=False,
+            "pair", key="limits.separation_allowance", source="a plan", monitored=False,
         ),
         Quantity(
             "clearance", "m", "least distance of a vehicle's surface to an obstacle or the ground", "obstacle",
@@ -156,7 +158,7 @@ QUANTITIES: dict[str, Quantity] = {
         ),
         Quantity(
             "thrust", "N", "thrust of the vehicle that comes nearest to its limit; the greatest if none has one",
-            key="agents.thrust_limit", order=2, way="thrust", by_phase=True,
+            key="agents.thrust_limit", order=2, way="thrust", source="forces", by_phase=True,
         ),
         Quantity("thrust_margin", "N", "greatest thrust minus its limit", checked=False),
         Quantity(
@@ -166,16 +168,16 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity(
             "saturation", "%", "greatest share of a phase in which a vehicle is asked for more than its rotors give",
             key="limits.saturation", limit=lambda m: 100.0 * m.limits.saturation, scale=100.0, monitored=False,
-            nothing="no vehicle is asked for more than its rotors give",
+            source="forces of rotors", nothing="no vehicle is asked for more than its rotors give",
         ),
         Quantity(
             "tilt", "deg", "greatest tilt of a vehicle; of points, of the thrust that their slots need",
             key="limits.tilt_deg", order=2, way="tilt", scale=degrees(1.0), nothing="no slots are tracked",
-            monitored=False,
+            source="a plan or attitudes", monitored=False,
         ),
         Quantity(
             "tracking_error", "m", "greatest distance of a vehicle from its slot", key="limits.tracking_error",
-            nothing="no slots are tracked", monitored=False,
+            nothing="no slots are tracked", source="a plan", monitored=False,
         ),
         Quantity(
             "guarantee", "m", "least distance to others or obstacles that is left if vehicles brake at once", "pair",
@@ -184,16 +186,17 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity("clearance_guarantee", "m", "", "obstacle", "least", monitored=False, checked=False),
         Quantity(
             "constraint", "m", "greatest constraint error |c| = |L - d|: edge length minus reference", "edge", "size",
-            by_phase=True,
+            source="edges", by_phase=True,
         ),
-        Quantity("constraint_force", "N", "greatest constraint force on a vehicle", by_phase=True),
+        Quantity("constraint_force", "N", "greatest constraint force on a vehicle", source="forces", by_phase=True),
         Quantity(
             "tension", "N", "tension of greatest size in an edge; negative: compression", "edge", "size",
-            by_phase=True,
+            source="forces", by_phase=True,
         ),
         Quantity(
             "singular_value", "", "least singular value of the constraint Jacobian", "formation", "least",
-            words="smallest singular value of J {worst} at {when:.2f} s", monitored=False, by_phase=True,
+            words="smallest singular value of J {worst} at {when:.2f} s", source="edges", monitored=False,
+            by_phase=True,
         ),
     )
 }  # fmt: skip
@@ -205,8 +208,10 @@ MOTIONS = tuple(
 LIMITS_OF_CURVES = [
     name
     for name, q in QUANTITIES.items()
-    if q.monitored and q.key == f"limits.{name}" and not q.limit
+    if not q.source and q.key == f"limits.{name}" and not q.limit
 ]
+#: What limits are judged by, by their keys, that positions over time do not show.
+SOURCES = {q.key.removeprefix("limits."): q.source for q in QUANTITIES.values() if q.source}
 
 
 def display_unit(unit: str) -> str:

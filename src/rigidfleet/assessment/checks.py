@@ -33,6 +33,8 @@ from rigidfleet.result.quantities import Samples
 _CONTACT = 1e-6
 #: Greatest jump of a velocity that counts as rounding [m/s].
 _CORNER = 0.01
+#: Why a motion of a curve is not judged.
+_NO_MOTION = "straight lines between samples have none. Assume cubics, or give velocities"
 #: Greatest distance from the nearest sample at which a moment is still judged [s]: at 10 m/s, a vehicle then
 #: flies the tolerance of a waypoint.
 _UNSEEN = 0.01
@@ -73,11 +75,9 @@ def _quantity_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
     if limit is None and not q.by_phase:
         return
     e = measured.worst(q.name)
-    if e is None and limit is not None and q in MOTIONS and measured.result.interpolation:
-        words = (
-            f"{q.name_in_words} cannot be judged (limit {limit:g} {q.unit}): straight lines between samples have none."
-            " Assume cubics, or give velocities"
-        )
+    if e is None and limit is not None and q.who != "pair" and measured.result.interpolation:
+        words = f"{q.name_in_words} cannot be judged (limit {limit:g} {q.unit}): "
+        words += _NO_MOTION if q in MOTIONS else "positions over time do not show it"
         yield CheckResult(q.name, False, words, None, limit, q.unit, at_least=q.at_least)
     elif e is not None or limit is not None:
         yield limit_check(q, e, limit)

@@ -8,7 +8,7 @@ tests compare them with dense samples.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import NamedTuple
 
@@ -55,10 +55,14 @@ class Reached(NamedTuple):
 
 
 def limits_of(
-    mission: Mission, limits: Limits | None = None, reserve: Floats | None = None
+    mission: Mission,
+    limits: Limits | None = None,
+    reserve: Floats | None = None,
+    unlimited: Collection[str] = (),
 ) -> list[Limit]:
     """The limits that a mission sets to its references, or other ``limits`` in place of its own.
 
+    Quantities ``unlimited`` by name are there without a limit, too: it is then infinite.
     With ``reserve`` (N,) [s], quantities are the greatest that vehicles reach (`planning.vehicles.tracking_lag_times`).
     """
     limits, n = limits or mission.limits, mission.n_agents
@@ -88,8 +92,8 @@ def limits_of(
     for q in (*MOTIONS, QUANTITIES["tilt"], QUANTITIES["thrust"]):
         table, _, key = q.key.partition(".")
         most = mission.fleet.thrust_limit if table == "agents" else getattr(limits, key)
-        if most is not None and np.isfinite(most).any():
-            most = np.broadcast_to(np.asarray(most, dtype=float), n)
+        most = np.broadcast_to(np.asarray(np.inf if most is None else most, dtype=float), n)
+        if q.name in unlimited or np.isfinite(most).any():
             finite.append(Limit(q, most, partial(ways.get(q.way, motion_with_overshoot), q)))
     return finite
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, display_unit
+from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity
 from rigidfleet.math import attitude as att
 from rigidfleet.plotting import quadrotors
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.peaks import IDLE, Panel, distinct_thrust_limits, peak_before_breakdown
+from rigidfleet.plotting.peaks import IDLE, Panel, distinct_limits, peak_before_breakdown
 from rigidfleet.result import Extremum, Result
 from rigidfleet.result.quantities import owner_name, samples
 from rigidfleet.typing import Floats
@@ -267,11 +267,11 @@ def has_thrust(result: Result) -> bool:
 def draw_thrust_or_distance(ax: Axes, result: Result) -> None:
     """Thrust of each agent with its limit, from zero; of a log, which has none, the distance from its slot."""
     if not has_thrust(result):
-        quadrotors.draw_slot_distance(ax, result)
+        quadrotors.draw_with_limit(ax, result, "tracking_error")
         return
     ax.set_ylabel("thrust [N]")
     panel = Panel(ax, result, result.thrust, "N", result.extreme("thrust"))
-    panel.draw(distinct_thrust_limits(result.mission.fleet.thrust_limit), always=False)
+    panel.draw(distinct_limits(result.mission, QUANTITIES["thrust"]), always=False)
 
 
 @st.styled_figure(has_thrust, "forces are not known")
@@ -297,8 +297,7 @@ def constraint_force(result: Result) -> Figure:
     idle = [np.nanmax(np.abs(v), initial=0.0) <= IDLE for v in (force, tension)]
     shares = [_TEXT_ROW if still else 1.0 for still in idle]
     fig, (above, below) = st.time_figure(result, "Constraint force", 2, shares=shares)
-    above.set_ylabel("constraint force [N]")
-    if Panel(above, result, force, "N", result.extreme("constraint_force")).draw():
+    if quadrotors.draw_with_limit(above, result, "constraint_force", force):
         st.draw_agents_legend(above, result.n_agents)
     below.set_ylabel("tension [N]")
     name = lambda k: f"edge {result.edge_labels[k]}"  # noqa: E731
@@ -322,7 +321,7 @@ def disturbance(result: Result) -> Figure:
     force = np.where(result.left, np.linalg.norm(result.disturbance_force, axis=2), np.nan)
     if Panel(above, result, force, "N").draw():
         st.draw_agents_legend(above, result.n_agents)
-    quadrotors.draw_slot_distance(below, result)
+    quadrotors.draw_with_limit(below, result, "tracking_error")
     return fig
 
 
@@ -488,7 +487,6 @@ def motion(result: Result) -> Figure:
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]
     fig, axes = st.time_figure(result, "Speed, acceleration and jerk", len(drawn), height=1.8)
     for q, ax in zip(drawn, axes, strict=True):
-        ax.set_ylabel(f"{q.name_in_words.replace(' ', chr(10))} [{display_unit(q.unit)}]")
         quadrotors.draw_with_limit(ax, result, q.name)
     st.draw_agents_legend(axes[0], result.n_agents)
     return fig

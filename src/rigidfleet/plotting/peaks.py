@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigidfleet._common.quantities import Quantity, display_unit
 from rigidfleet.plotting import style as st
 from rigidfleet.result import Extremum, Result
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from rigidfleet.mission import Mission
 
 #: Force [N] or displacement [m] below which there is only rounding.
 IDLE = 1e-6
@@ -31,15 +34,17 @@ def peak_before_breakdown(result: Result, values: Floats) -> float:
     return peak if result.complete or peak < 10 * usual else 2 * usual
 
 
-def distinct_thrust_limits(values: Floats) -> list[Limit]:
-    """Each distinct limit of the agents' limits (N,) with a label and a colour; the agent's if only one has it."""
+def distinct_limits(mission: Mission, q: Quantity) -> list[Limit]:
+    """Each distinct limit that a mission sets with a label and a colour; the agent's if only one has it."""
+    limit, unit = q.limit_of(mission), display_unit(q.unit)
+    values = np.full(mission.n_agents, np.nan if limit is None else limit, dtype=float)
     colours = st.agent_colours(len(values))
     lines = []
     for value in np.unique(values[np.isfinite(values)]).tolist():
         of = np.flatnonzero(values == value)
         colour = colours[of[0]] if len(of) == 1 < len(values) else st.ALERT
         who = "" if len(of) == len(values) else " of " + ", ".join(str(i + 1) for i in of[:6])
-        lines.append((value, f"limit{who} {value:.4g} N", colour))
+        lines.append((value, f"limit{who} {value:g} {unit}", colour))
     return lines
 
 

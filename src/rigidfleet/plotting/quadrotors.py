@@ -9,7 +9,7 @@ import numpy as np
 from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.logged import true_runs
-from rigidfleet.plotting.peaks import Panel
+from rigidfleet.plotting.peaks import Panel, distinct_limits
 from rigidfleet.result import LABELS, Extremum, Result
 from rigidfleet.result.quantities import samples
 from rigidfleet.typing import Bools, Floats
@@ -105,32 +105,25 @@ def vehicles(result: Result) -> Figure:
     shares = (1.0, 1.0, 0.6 if saturated.any() else _TEXT_ROW)
     title = "Tilt, tracking error and saturation of the vehicles"
     fig, (above, middle, below) = st.time_figure(result, title, 3, height=1.9, shares=shares)
-    above.set_ylabel("tilt [deg]")
     draw_with_limit(above, result, "tilt", tilt(result))
     st.draw_agents_legend(above, result.n_agents)
-    draw_slot_distance(middle, result)
+    draw_with_limit(middle, result, "tracking_error")
     _draw_saturation(below, result, saturated)
     return fig
 
 
-def draw_slot_distance(ax: Axes, result: Result) -> None:
-    """Distance of each vehicle from its slot, with the mission's limit."""
-    ax.set_ylabel("from the slot [m]")
-    draw_with_limit(ax, result, "tracking_error")
-
-
-def draw_with_limit(ax: Axes, result: Result, name: str, values: Floats | None = None) -> None:
-    """Each agent's values (K, N) of a quantity from zero, with their greatest and the mission's limit."""
+def draw_with_limit(ax: Axes, result: Result, name: str, values: Floats | None = None) -> bool:
+    """Draw each agent's values (K, N) of a quantity, their greatest and the limits; return whether there are any."""
     q, between = QUANTITIES[name], result.extreme(name)
+    ax.set_ylabel(f"{q.name_in_words.replace(' ', chr(10))} [{display_unit(q.unit)}]")
     values = samples(result, name).values if values is None else values
     if not np.isfinite(values).any():
         st.mark_empty(ax, q.nothing)
-        return
+        return False
     if between is not None:
         between = between._replace(value=q.scale * between.value, other=-1)
-    limit, unit = q.limit_of(result.mission), display_unit(q.unit)
-    limits = [] if limit is None else [(limit, f"limit {limit:g} {unit}", st.ALERT)]
-    Panel(ax, result, values, unit, between).draw(limits)
+    panel = Panel(ax, result, values, display_unit(q.unit), between)
+    return panel.draw(distinct_limits(result.mission, q))
 
 
 def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:

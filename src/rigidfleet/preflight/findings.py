@@ -21,6 +21,7 @@ from rigidfleet._common.facts import (
     table_of_worst_values,
 )
 from rigidfleet._common.plain import to_json_data
+from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet._common.text import agent_names, first_few
 from rigidfleet.math import proximity
 from rigidfleet.math.margins import Margins
@@ -46,11 +47,8 @@ MANY = 12
 #: A limit is exceeded only by more than this rounding error.
 SLACK = 1e-9
 
-#: Worst values of the planned paths: the key of each in JSON, and its unit.
-_WORST = {
-    "separation": ("separation_m", "m"), "speed": ("speed_m_s", "m/s"), "vertical_speed": ("speed_m_s", "m/s"),
-    "thrust": ("thrust_n", "N"),
-}  # fmt: skip
+#: Quantities whose worst planned values are shown without a limit, too.
+WORST_SHOWN = ("separation", "speed", "vertical_speed", "thrust")
 #: Forces of disturbances in words.
 _FORCES = {
     "air": "steady wind", "gusts": "gusts (3 sigma)", "weight": "weight error", "noise": "noise (3 sigma)",
@@ -317,9 +315,8 @@ class Preflight(Shown):
     mission : with its times known
     formations, gains : checks of the formations and of the constraint law
     planned_phases : planned paths of each phase
-    separation : minimum separation [m], its time [s] and the agents
-    speed, vertical_speed : greatest planned ones [m/s], their times [s] and agents
-    thrust : maximum planned thrust [N], its time [s], the agent and its limit [N]
+    worst : by quantity, the planned value nearest to its limit: the value, its time [s], whose it is, and the limit,
+        which is None or infinite if there is none
     clearance : of each obstacle: its name, minimum clearance [m], time [s], agent
     gaps : of each gap: its obstacles, its width [m], the width that the formation needs [m], time [s]
     assignments : assignments to slots that were compared, by name
@@ -343,10 +340,7 @@ class Preflight(Shown):
     formations: list[FormationCheck]
     gains: GainsCheck
     planned_phases: list[PlannedPhase]
-    separation: tuple[float, float, str] | None = None
-    speed: tuple[float, float, str] | None = None
-    vertical_speed: tuple[float, float, str] | None = None
-    thrust: tuple[float, float, str, float] | None = None
+    worst: dict[str, Any] = field(default_factory=lambda: dict.fromkeys(WORST_SHOWN))
     clearance: list[tuple[str, float, float, str]] = field(default_factory=list)
     gaps: list[tuple[str, float, float, float]] = field(default_factory=list)
     assignments: dict[str, Assignment] = field(default_factory=dict)
@@ -424,28 +418,20 @@ class Preflight(Shown):
             places |= {f"'{f.name}'": f.spacing_m for f in self.formations}
             for where, apart in places.items():
                 yield Fact("spacing, centre to centre", apart, "m", who=where)
-        for name, (_, unit) in _WORST.items():
-            if (worst := getattr(self, name)) is not None:
-                value, t, who, *own = worst
-                limit = own[0] if own else getattr(self.mission.limits, name)
-                limit = None if limit is None or not math.isfinite(limit) else limit
-                yield Fact(name.replace("_", " "), value, unit, limit, name == "separation", t, who)
+        for name, q in QUANTITIES.items():
+            if (worst := self.worst.get(name)) is not None:
+                value, t, who, limit = worst
+                yield Fact(q.name_in_words, value, q.unit, limit, q.at_least, t, who)
         if certificates := self.certificates:
             phase, least = min(certificates.items(), key=lambda item: item[1].separation)
             who = f"{agent_names(least.agents)}, '{phase}' ({least.how})"
             limit = self.mission.limits.separation
             yield Fact("separation, proved", least.separation, "m", limit, True, least.time, who)
-        if self.vehicles is not None:
-            force, t, who, limit, _ = self.vehicles.rotor_force
-            yield Fact("rotor force", force, "N", limit, when=t, who=who)
-            tilt, t, who, _ = self.vehicles.tilt
-            yield Fact("tilt", tilt, "deg", when=t, who=who)
         if (d := self.disturbed) is not None:
             for name, what in _FORCES.items():
                 if (force := getattr(d, name)) > 0:
                     yield Fact(f"force of {what}", force, "N")
             force, t, who, limit = d.thrust
-            limit = limit if math.isfinite(limit) else None
             yield Fact("thrust, disturbed", force, "N", limit, when=t, who=who)
             if d.offset[0] > 0:
                 yield Fact("steady offset from a slot", d.offset[0], "m", who=d.offset[1])
@@ -457,6 +443,16 @@ class Preflight(Shown):
             yield Fact("clearance", least, "m", when=t, who=f"{who}, '{name}'")
         if self.reserve:
             yield Fact("reserve of automatic times", self.reserve, "s")
+
+    @property
+    def separation(self) -> tuple[float, float, str] | None:
+        """Minimum planned separation [m], its time [s] and the agents."""
+        return (worst := self.worst["separation"]) and worst[:3]
+
+    @property
+    def thrust(self) -> tuple[float, float, str, float] | None:
+        """Planned thrust nearest to its limit [N], its time [s], the agent and its limit [N]."""
+        return self.worst["thrust"]
 
     def _headed_sentences(self) -> Iterator[tuple[str, str]]:
         """What is said in words, each with its heading."""
@@ -496,10 +492,7 @@ class Preflight(Shown):
                 "guessed_phases": [
                     planned.phase for planned in self.planned_phases if not planned.exact
                 ],
-                **{
-                    name: _values_by_name(f"{key} time_s who limit_n", getattr(self, name))
-                    for name, (key, _) in _WORST.items()
-                },
+                **{name: _worst_value_data(name, worst) for name, worst in self.worst.items()},
                 "certificates": [
                     _values_by_name(proof, (phase, least, t, np.add(who, 1), how))
                     for phase, (least, t, who, how) in self.certificates.items()
@@ -584,6 +577,12 @@ def names_with_verb(names: Sequence[str]) -> str:
     """First names, the number of the others, and "is" or "are"."""
     text = first_few([f"'{name}'" for name in names], _MOST_NAMES)
     return f"{text} {'is' if len(names) == 1 else 'are'}"
+
+
+def _worst_value_data(name: str, worst: Sequence[Any] | None) -> dict[str, Any] | None:
+    """Worst value of a quantity, its time, who has it, and its limit, with units in the keys."""
+    unit = QUANTITIES[name].unit.lower().replace("/", "_").replace("^", "")
+    return _values_by_name(f"{name.rpartition('_')[2]}_{unit} time_s who limit_{unit}", worst)
 
 
 def _values_by_name(names: str, values: Sequence[Any] | None) -> dict[str, Any] | None:

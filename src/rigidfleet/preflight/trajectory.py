@@ -23,7 +23,7 @@ from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.reference import pose_at
 from rigidfleet.planning.vehicles import airflow_force
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
-from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark
+from rigidfleet.preflight.findings import DENSE, SLACK, WORST_SHOWN, Disturbed, Preflight, Remark
 from rigidfleet.rigidity import jacobian
 from rigidfleet.typing import Floats
 
@@ -66,7 +66,7 @@ def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
             if exact not in worst or at[0] < worst[exact][0][0]:
                 worst[exact] = at, planned.phase
     if np.isfinite(least[0]):
-        preflight.separation = least[0], least[1], agent_names(least[2])
+        preflight.worst["separation"] = *least[:2], agent_names(least[2]), mission.limits.separation
     for exact, (at, phase) in worst.items():
         if at[0] <= 0 or at[0] < limit - SLACK:
             yield _collision_remark(mission, at, phase, exact=exact)
@@ -145,18 +145,22 @@ def _value_nearest_to_limit(
 
 
 def find_planned_peaks(mission: Mission, preflight: Preflight) -> None:
-    """Find the greatest planned speeds [m/s] and the thrust [N] that is nearest to its limit, at samples."""
-    way = preflight.planned_phases
-    if not way:
-        return
-    mass, weight = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
-    needs = [mass * np.linalg.norm(planned.acceleration + weight, axis=2) for planned in way]
-    preflight.thrust = _value_nearest_to_limit(way, needs, mission.fleet.thrust_limit)
-    speeds = [np.linalg.norm(planned.velocity, axis=2) for planned in way]
-    climbs = [np.abs(planned.velocity[..., 2]) for planned in way]
-    unlimited = np.full(mission.n_agents, np.inf)
-    preflight.speed = _value_nearest_to_limit(way, speeds, unlimited)[:3]
-    preflight.vertical_speed = _value_nearest_to_limit(way, climbs, unlimited)[:3]
+    """Find what of each motion is nearest to its limit, at samples; jerk and tilt are those of tracked slots."""
+    for limit in limits_of(mission, unlimited=WORST_SHOWN):
+        q, way = limit.of, preflight.planned_phases
+        if q.order == 3 or q.name == "tilt":
+            way = [planned for planned in way if planned.leg.phase.control == "tracking"]
+        if way:
+            states = (_planned_states(planned, q.order) for planned in way)
+            values = [limit.values(x, np.arange(mission.n_agents)) for x in states]
+            preflight.worst[q.name] = _value_nearest_to_limit(way, values, limit.most)
+
+
+def _planned_states(planned: PlannedPhase, order: int) -> Floats:
+    """Planned positions and their derivatives up to an order, at least the second (K, order + 1, N, 3)."""
+    if order == 3:
+        return slot_derivatives(*planned.leg.slots_and_motion, planned.time, 4)
+    return np.stack([planned.position, planned.velocity, planned.acceleration], axis=1)
 
 
 def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -303,7 +307,7 @@ def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark
 
 def _broken_limit_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
     """Remarks on speed, acceleration and thrust of samples beyond their limits."""
-    x = np.stack([planned.position, planned.velocity, planned.acceleration], axis=1)
+    x = _planned_states(planned, 2)
     for limit in limits_of(mission):
         q = limit.of
         if q.order > 2 or q.name == "tilt":

@@ -128,6 +128,8 @@ def vehicle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on rotors that the plan asks too much of, on jumps, and on vehicles in the jets of others."""
     if preflight.vehicles is None:
         return
+    preflight.worst["rotor_force"] = preflight.vehicles.rotor_force[:4]
+    preflight.worst["tilt"] = *preflight.vehicles.tilt[:3], mission.limits.tilt_deg
     exact = {planned.phase for planned in preflight.planned_phases if planned.exact}
     if preflight.vehicles.beyond is not None:
         share, who, phase, need = preflight.vehicles.beyond

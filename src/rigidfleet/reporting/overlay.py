@@ -10,6 +10,7 @@ import numpy as np
 from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.plotting import encode_figure
 from rigidfleet.plotting import style as st
+from rigidfleet.plotting.peaks import distinct_limits
 from rigidfleet.result.quantities import samples
 
 if TYPE_CHECKING:
@@ -52,8 +53,10 @@ def svg_of_time_curves(flights: Sequence[Result], labels: Sequence[str]) -> byte
                 ax.plot(flight.time, values, **look)
                 known |= bool(np.isfinite(values).any())
             q, logarithmic = QUANTITIES[name], name in ("tracking_error", "constraint")
+            for limit in dict.fromkeys(x for f in flights for x in distinct_limits(f.mission, q)):
+                st.draw_limit(ax, *limit)
             worst = "least" if q.at_least else "greatest"
-            ax.set_title(f"{worst} {q.name_in_words} [{display_unit(q.unit)}]")
+            ax.set_title(f"{worst} {q.name_in_words} [{display_unit(q.unit)}]", loc="left")
             if not known:
                 st.mark_empty(ax, "nothing to show")
             elif logarithmic:

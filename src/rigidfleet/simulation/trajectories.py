@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet._common.quantities import PLACES, QUANTITIES
+from rigidfleet._common.quantities import SOURCES
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.curves import ASSUMED, Trajectories
 from rigidfleet.kernel import records
@@ -56,12 +56,6 @@ NAMES = {
     3: "cubics",
     5: "quintics",
     7: "polynomials of degree 7",
-}
-#: Limits of a mission that positions over time do not show.
-UNJUDGED = {
-    q.key.removeprefix("limits.")
-    for q in QUANTITIES.values()
-    if not q.monitored and q.who not in PLACES
 }
 #: What of a mission trajectories are judged by, beside radii and masses.
 _JUDGING = (
@@ -120,7 +114,8 @@ def trajectories(
     Raises
     ------
     ResultError
-        The arrays are no trajectories: a wrong shape, values that are not finite, times that do not increase.
+        The arrays are no trajectories: a wrong shape, values that are not finite, times that do not increase. Or
+        positions over time do not show what a limit is of.
     MissionError
         A limit is invalid.
     """
@@ -211,7 +206,7 @@ def judging_mission(
     MissionError
         A limit is invalid.
     ResultError
-        The mission has another number of vehicles.
+        The mission has another number of vehicles, or positions over time do not show what a limit is of.
     """
     lasting = max(duration, 1e-3)
     phase = {"kind": "hold", "name": PHASE, "control": "open", "duration": lasting}
@@ -224,12 +219,15 @@ def judging_mission(
             )
         data = {key: x for key, x in own.to_dict().items() if key in _JUDGING}
         bounds = data.get("limits", {})
-        data["limits"] = {key: x for key, x in bounds.items() if key not in UNJUDGED}
+        data["limits"] = {key: x for key, x in bounds.items() if key not in SOURCES}
         agents |= {"radius": list(own.agents.radius), "mass": list(own.agents.mass)}
         if own.people:  # what fails falls through the air of the mission
             wind = (0.0, 0.0, 0.0) if own.disturbances is None else own.disturbances.wind
             data["disturbances"] = {"wind": list(wind), "drag": own.drag.tolist()}
     else:
+        for key in filter(SOURCES.get, limits or {}):
+            problem = f"is judged by {SOURCES[key]}, which positions over time do not show"
+            raise ResultError(f"limits.{key}: {problem}. Leave it out.")
         if "separation_below" in (limits or {}) and radius == 0.0:
             raise ResultError(
                 "separation_below needs radii: one vehicle is below another where their spheres overlap as seen from "
