@@ -4,8 +4,8 @@
 proportion to their lines of code, and tests each. It writes a line of JSON for each into the file, goes on there if it
 was stopped, tests survivors again, and lists those that are left. Each calls for a test, or for an entry in
 `mutants.toml` with the proof that nothing changes. `--count`, `--seed` and `--jobs` are as they say, a mutant on which
-the tests have spent `--most` seconds survives, `--only 3 7` takes some of those drawn, `--list` runs none, and
-`--as-is` tells which tests pass without a fault, and how long they take.
+the tests have spent `--most` seconds survives, `--only 3 7` takes some of those drawn, `--tests` some of the tests, as
+pytest's `-k` does, `--list` runs none, and `--as-is` tells which tests pass without a fault, and how long they take.
 
 The operators:
 
@@ -25,6 +25,9 @@ calls. For a mutant, it forks, puts the code of the changed function in the plac
 that call it, the quickest first, until one fails. Nothing is compiled: flights are flown by the machine code of the
 code without faults, and call the functions under test as plain Python, on their own arrays (`fly_with`). Tests that
 fail or take too long in this way without a fault are left out. Time is that of the processor.
+
+What says nothing of the tests is an error, and the command ends with 1: a mutant that no test reaches, or that cannot
+be tried; more than a tenth of the tests that fail without a fault; what `fly_with` replaces and is not there.
 """
 
 from __future__ import annotations
@@ -35,6 +38,7 @@ import copy
 import ctypes
 import hashlib
 import importlib
+import inspect
 import json
 import os
 import resource
@@ -59,6 +63,8 @@ PACKAGE = ROOT / "src" / "rigidfleet"
 LONGEST = 3.0
 #: Processor time after which a test with a fault counts as one that does not end: so many times its own, and more [s].
 TIMES, MORE = 4.0, 3.0
+#: Share of the tests of a file that may fail without a fault: some few need the compiler.
+FAILING = 0.1
 #: Examples that property tests try.
 EXAMPLES = 20
 #: Variable with what a process that tests mutants is to do.
@@ -189,10 +195,11 @@ class _Dropped(ast.NodeTransformer):
         return ast.Pass() if node is self.statement else super().generic_visit(node)
 
 
-def mutated(tree: ast.Module, site: Site) -> ast.Module:
-    """A copy of a module with a fault."""
-    tree = copy.deepcopy(tree)
-    node: Any = list(ast.walk(tree))[site.node]
+def mutated(function: ast.FunctionDef, original: ast.AST, site: Site) -> ast.FunctionDef:
+    """A copy of a function with a fault at one of its nodes, ``original``."""
+    copies: dict[int, Any] = {}
+    function = copy.deepcopy(function, copies)
+    node: Any = copies[id(original)]
     match site.operator:
         case "compare":
             node.ops = [_EDGE[type(node.ops[0])]()]
@@ -217,8 +224,8 @@ def mutated(tree: ast.Module, site: Site) -> ast.Module:
         case "refuse":
             node.test = ast.UnaryOp(ast.Not(), node.test)
         case "drop":
-            tree = _Dropped(node).visit(tree)
-    return ast.fix_missing_locations(tree)
+            function = _Dropped(node).visit(function)
+    return ast.fix_missing_locations(function)
 
 
 class Mutant(NamedTuple):
@@ -259,14 +266,14 @@ def draw(count: int, seed: int) -> list[Mutant]:
     bounds = np.round(np.concatenate([[0], np.cumsum(lines)]) / lines.sum() * count).astype(int)
     mutants: list[Mutant] = []
     for target, tree, number in zip(TARGETS, trees, np.diff(bounds), strict=True):
-        sites = sites_of(tree)
+        sites, nodes = sites_of(tree), list(ast.walk(tree))
         for k in rng.permutation(len(sites))[:number]:
-            changed = mutated(tree, sites[k])
-            function = function_at(tree, sites[k].line).name
-            texts = [ast.unparse(named(x, function)).splitlines() for x in (tree, changed)]
+            function = function_at(tree, sites[k].line)
+            changed = mutated(function, nodes[sites[k].node], sites[k])
+            texts = [ast.unparse(x).splitlines() for x in (function, changed)]
             pairs = [(a.strip(), b.strip()) for a, b in zip(*texts, strict=False) if a != b]
             mutants.append(
-                Mutant(len(mutants), target, sites[k], function, *(pairs or [("", "")])[0])
+                Mutant(len(mutants), target, sites[k], function.name, *(pairs or [("", "")])[0])
             )
     return mutants
 
@@ -294,8 +301,10 @@ def proved() -> dict[tuple[str, str, str, str], str]:
 def put_in(mutant: Mutant) -> None:
     """Put the code of a function with a fault in the place of its own."""
     path = PACKAGE / mutant.target.file
-    tree = mutated(ast.parse(path.read_text()), mutant.site)
-    every = compile(tree, str(path), "exec").co_consts
+    tree = ast.parse(path.read_text())
+    node = list(ast.walk(tree))[mutant.site.node]
+    function = mutated(function_at(tree, mutant.site.line), node, mutant.site)
+    every = compile(ast.Module([function], []), str(path), "exec").co_consts
     code = next(x for x in every if getattr(x, "co_name", None) == mutant.function)
     name = "rigidfleet." + mutant.target.file.removesuffix(".py").replace("/", ".")
     getattr(importlib.import_module(name), mutant.function).__code__ = code
@@ -319,6 +328,8 @@ def forked(tasks: list[Any], work: Callable[[Any, Path], None], jobs: int) -> It
                         os.dup2(null, stream)
                     try:
                         work(task, out)
+                    except BaseException as error:  # not of a test: pytest catches those
+                        out.write_text(json.dumps({"error": repr(error)}))
                     finally:
                         os._exit(0)
                 running[pid] = task, out
@@ -353,10 +364,11 @@ def reach_of(
     session: pytest.Session, files: list[str], jobs: int, kept: Path | None
 ) -> dict[str, Any]:
     """Of each test: whether it passes, how long it takes [s], and the functions of files that it calls."""
-    sources = hashlib.sha256(b"".join(x.read_bytes() for x in sorted(PACKAGE.rglob("*.py"))))
+    read = *sorted(PACKAGE.rglob("*.py")), Path(__file__)
+    sources = hashlib.sha256(b"".join(x.read_bytes() for x in read))
 
     def path_of_keys(item: pytest.Item) -> str:
-        """Name of a test with the code that it was known for: that of the package and of its file."""
+        """Name of a test with the code that it was known for: that of the package, of this file and of its own."""
         digest = sources.copy()
         digest.update(item.path.read_bytes())
         return f"{digest.hexdigest()[:16]} {item.nodeid}"
@@ -400,17 +412,25 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
     """Instead of running the tests once, run those that reach a mutant with it, for each mutant."""
     if _TASK not in os.environ:
         return None
+    if session.testsfailed:
+        raise session.Interrupted(f"{session.testsfailed} files of tests cannot be read")
     task = json.loads(os.environ[_TASK])
     targets = [TARGETS[k] for k in task["targets"]]
     into = Path(task["into"]) if task["into"] else None
     kept = into and into.with_suffix(f".{targets[0].plain or 'checks'}.reach")
     reach = reach_of(session, [x.file for x in targets], task["jobs"], kept)
+    failing = [name for name, of in reach.items() if of["why"] in ("fails", "died")]
     if task["as_is"]:
         for name, of in reach.items():
             print(
                 f"{'passes' if of['passes'] else of['why']:8} {of.get('s', 0.0):6.2f} s {name}",
                 flush=True,
             )
+    if len(failing) > FAILING * len(reach):
+        raise session.Interrupted(
+            f"{len(failing)} of {len(reach)} tests fail without a fault, as {failing[0]}"
+        )
+    if task["as_is"]:
         return True
     items = {item.nodeid: item for item in session.items}
 
@@ -420,6 +440,8 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
             name for name, of in reach.items() if of["passes"] and here in map(list, of["reaches"])
         ]
         put_in(mutant)
+        if not names:
+            raise LookupError(f"no test that passes without a fault reaches {mutant.function}")
         by, begun = "", time.process_time()
         for name in sorted(names, key=lambda x: reach[x]["s"]):
             if time.process_time() - begun > task["most"]:
@@ -433,7 +455,8 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
 
     chosen = [x for x in draw(task["count"], task["seed"]) if x.number in task["numbers"]]
     for mutant, wrote, took in forked(chosen, test, task["jobs"]):
-        outcome = wrote or {"killed": True, "by": "died", "tests": 0}
+        words = wrote or {"killed": True, "by": "died"}
+        outcome = {"killed": False, "by": "", "tests": 0} | words
         line = json.dumps(mutant.to_dict() | outcome | {"s": took})
         print(line, flush=True)
         if into:
@@ -445,27 +468,46 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
 # -- functions as plain Python -----------------------------------------------------------------------
 
 
+def replace(owner: Any, name: str, function: Any) -> None:
+    """Put a function in the place of one that exists and takes as many arguments, so that it is called.
+
+    Raises
+    ------
+    AttributeError, TypeError
+        There is no such function, or it takes others.
+    """
+
+    def parameters(of: Any) -> list[Any]:
+        every = inspect.signature(of).parameters.values()
+        return [(x.kind, x.default) for x in every if x.name != "_context"]  # the compiler's
+
+    takes, instead = parameters(getattr(owner, name)), parameters(function)
+    if takes != instead:
+        raise TypeError(f"{name} of {owner.__name__} takes other arguments: {takes}, not {instead}")
+    setattr(owner, name, function)
+
+
 def fly_with(plain: str) -> None:
     """Fly with machine code, but with guard or monitor as plain Python."""
     from rigidfleet.kernel.compiler import jit
 
-    compiler: Any = jit
-
-    def copied(function: Any, name: str, **instead: Any) -> Any:
+    def compiled_copy(function: Any, name: str, **instead: Any) -> Any:
         return jit._copy_function(function, name, instead)
 
-    compiler.compiled_copy = copied
+    replace(jit, "compiled_copy", compiled_copy)
     from rigidfleet.kernel import guard, monitor, obstacles
     from rigidfleet.kernel.engine import native, packing
 
-    def record(_: int, p: Any, w: Any, segment: int, out: int) -> None:
-        of = packing.pack(p).address, packing.pack(w).address
-        native.library().record(*of, segment, out)
+    word = ctypes.c_int64
+    kind = ctypes.CFUNCTYPE(word, *(word,) * 4)
+
+    def record(address: int, p: Any, w: Any, segment: int, out: int) -> None:
+        kind(address)(packing.pack(p).address, packing.pack(w).address, segment, out)
 
     def bound_distance_changes(watch: Any, problem: Any, state: Any) -> None:
         monitor.bound_distance_changes(problem, state, watch.monitor)
 
-    def distances(watch: Any, problem: Any, state: Any, first: int, end: int) -> None:
+    def search_distances(watch: Any, problem: Any, state: Any, first: int, end: int) -> None:
         monitor.watch_trail_distances(first, end, problem, state, watch.monitor)
 
     def search_clearances(
@@ -480,21 +522,20 @@ def fly_with(plain: str) -> None:
         monitor.watch_forces(int(last), problem, work, state, watch.monitor)
 
     def avoid(*addresses: int) -> int:
-        of = {x.address: x.of for x in packing._last.packed.values()}
+        last = packing._last.packed.values()
+        of = {x.address: x.of for x in last if isinstance(x, packing.Packed)}
         flight, state, avoidance = (of[x] for x in addresses[:3])
         problem, work = (of[int(x)] for x in avoidance.law)
         with np.errstate(all="ignore"):
             return int(guard.correct_forces(problem, work, flight, state, avoidance))
 
-    watching: Any = native.Watch
-    watching.search_clearances = search_clearances
+    replace(native.Watch, "search_clearances", search_clearances)
     if plain == "monitor":
-        monitor.call_recorder = record
-        for function in (bound_distance_changes, distances, search_forces):
-            setattr(native.Watch, function.__name__, function)
+        replace(monitor, "call_recorder", record)
+        for function in (bound_distance_changes, search_distances, search_forces):
+            replace(native.Watch, function.__name__, function)
     else:
-        word = ctypes.c_int64
-        call = ctypes.CFUNCTYPE(word, *(word,) * 4)(avoid)
+        call = kind(avoid)
         address = ctypes.cast(call, ctypes.c_void_p).value
         library = native.Library(avoid=call, addresses={"avoid": address})
         native._loaded["avoidance"] = library
@@ -513,8 +554,9 @@ def pytest_configure() -> None:
         settings.load_profile("mutants")
 
 
-def test_in_processes(numbers: set[int], given: argparse.Namespace) -> None:
-    """Test the mutants with these numbers; targets with the same tests share a process."""
+def test_in_processes(numbers: set[int], given: argparse.Namespace) -> bool:
+    """Test the mutants with these numbers, and return whether that was possible; the same tests share a process."""
+    possible = True
     for plain in dict.fromkeys(target.plain for target in TARGETS):
         targets = [k for k, target in enumerate(TARGETS) if target.plain == plain]
         of_them = {TARGETS[k].file for k in targets}
@@ -536,18 +578,22 @@ def test_in_processes(numbers: set[int], given: argparse.Namespace) -> None:
             env["NUMBA_DISABLE_JIT"] = "1"
         files = dict.fromkeys(f"tests/{name}" for k in targets for name in TARGETS[k].tests)
         options = ["-q", "-q", "-s", "-p", "mutants", "-p", "no:cacheprovider", "-p", "no:xdist"]
-        subprocess.run(
+        options += ["-k", given.tests] if given.tests else []
+        ran = subprocess.run(
             [sys.executable, "-m", "pytest", *options, *files], cwd=ROOT, env=env, check=False
         )
+        possible &= ran.returncode == 0
+    return possible
 
 
-def main() -> None:
-    """Draw mutants, test them and list the survivors."""
+def main() -> int:
+    """Draw mutants, test them and list the survivors; return 1 where that says nothing of the tests, else 0."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", type=int, nargs="*")
+    parser.add_argument("--tests", default="", help="an expression, as pytest's -k takes it")
     parser.add_argument("--into", help="file of results, which are kept")
     parser.add_argument("--most", type=float, default=30.0, help="processor time of a mutant [s]")
     parser.add_argument("--list", action="store_true")
@@ -557,7 +603,7 @@ def main() -> None:
     if given.list:
         for mutant in mutants:
             print(json.dumps(mutant.to_dict()))
-        return
+        return 0
     into = Path(given.into or Path(tempfile.mkdtemp(), "mutants.jsonl")).resolve()
     given.into = str(into)
     equal = proved()
@@ -565,12 +611,13 @@ def main() -> None:
     done = {(x["number"], x["file"], x["function"], x["from"], x["to"]): x for x in rows}
     killed = {name for name, row in done.items() if row["killed"]}  # survivors are tested again
     left = {x.number for x in mutants if x.key not in equal and (x.number, *x.key) not in killed}
-    test_in_processes(left, given)
+    possible = test_in_processes(left, given)
     if given.as_is:
-        return
+        return int(not possible)
     rows = [json.loads(line) for line in into.read_text().splitlines()] if into.exists() else []
     done = {(x["number"], x["file"], x["function"], x["from"], x["to"]): x for x in rows}
     judged = [done[x.number, *x.key] for x in mutants if (x.number, *x.key) in done]
+    untried = sorted(left - {x["number"] for x in judged if "error" not in x})
     same = sum(x.key in equal for x in mutants)
     killed = sum(x["killed"] for x in judged)
     slow = sum(x["by"].startswith("time") for x in judged)
@@ -581,7 +628,10 @@ def main() -> None:
     for x in judged:
         if not x["killed"]:
             print(json.dumps(x))
+    if untried or not possible:
+        print(f"error: not tried: {untried}", file=sys.stderr)
+    return int(not possible or bool(untried))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

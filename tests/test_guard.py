@@ -11,7 +11,7 @@ from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 from vehicle_samples import PAPER, begun
 
-from rigidfleet.kernel import barriers, fleet
+from rigidfleet.kernel import barriers, fleet, guard
 from rigidfleet.kernel.avoidance import (
     BARRIER,
     BRAKE,
@@ -232,6 +232,34 @@ def test_who_passes_beside_another_is_left_alone(seed):
         assert (crowd.a.acted[GUARD].sum() == 0) == free
 
 
+@pytest.mark.parametrize("drag", [0.0, 0.8])
+def test_who_brakes_just_in_time_may_also_fly_along_the_wall(drag):
+    """It comes to rest above the ground within the tick, which no other candidate than the one asked for does as well.
+
+    What rises over the tick makes its way bend away from the ground: it counts whole.
+    """
+    for speed in (0.1, 0.4):
+        v, way = np.array([0.0, 0.0, -speed]), speed * T / 2.0 + 0.002
+        ask = -braking(v, drag)[2] * np.array([0.0, 0.0, -1.0]) + [3.0, 0.0, 0.0]
+        crowd = Crowd(1, solids=one_solid(half_space(0.0)), filtered=False, drag=drag)
+        took = crowd([[0.0, 0.0, RADIUS + way]], [v], [ask])
+        assert took == pytest.approx(ask[None], abs=1e-9)
+        assert crowd.a.acted[GUARD].sum() == 0
+
+
+def test_who_is_left_alone_has_the_very_force_that_was_asked_for():
+    """To the bit, also beyond its thrust, if nothing is near: avoidance that has nothing to do changes nothing."""
+    rng = np.random.default_rng(4)
+    r, v = 100.0 * np.arange(12.0).reshape(4, 3), rng.normal(size=(4, 3))
+    for flow in (False, True):
+        crowd = Crowd(4, g=9.81, lift=14.0, flow=flow, mass=1.3)
+        crowd(r, v, 9.0 * rng.normal(size=(4, 3)))
+        force = 11.0 * rng.normal(size=(4, 3))
+        crowd.state.force[:] = force
+        assert sampled.correct_forces(crowd.problem, crowd.work, crowd.flight, crowd.state, crowd.a)
+        assert np.array_equal(crowd.state.force, force)
+
+
 def test_margins_are_the_least_so_far_and_the_first_that_is_lost():
     """Of two that come nearer and part, and of one beside a ball: the least margin, and the first negative one."""
     things = one_solid(ball([0.0, 0, 5.0], 1.0))
@@ -431,6 +459,39 @@ def test_whoever_could_meet_by_the_next_tick_is_listed(seed):
     assert 1 < renewed < 40
 
 
+@pytest.mark.parametrize("filtered", [False, True])
+@pytest.mark.parametrize(("down", "lift"), [(False, 50.0), (True, 50.0), (True, 12.0)])
+def test_at_no_distance_two_may_begin_what_braking_cannot_end(down, lift, filtered):
+    """Both at rest, asked to fly at each other with all their thrust: after the tick, both still stop in time.
+
+    Also downwards, where gravity helps. There, one of them alone is asked to.
+    """
+    g, one = (9.81, np.array([0.0, 0.0, -1.0])) if down else (0.0, np.array([0.6, 0.0, 0.8]))
+    asked = np.array([lift * one - [0.0, 0.0, g], -lift * one - [0.0, 0.0, g]])
+    if down:
+        asked[1] = 0.0
+    held = 0
+    for gap in np.linspace(0.1, 12.0, 60):
+        r, v = np.array([np.zeros(3), (2 * RADIUS + gap) * one]), np.zeros((2, 3))
+        crowd = Crowd(2, g=g, lift=lift, filtered=filtered)
+        took = crowd(r, v, asked)
+        held += not np.allclose(took, asked)
+        segments = [stop(*(x[0] for x in course(r[i], v[i], took[i], 0.0, [T]))) for i in range(2)]
+        assert apart(*segments) >= 2 * RADIUS - 1e-6, gap
+    assert held > 0
+    assert filtered or not listed(crowd.a)  # so far away, none could
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.2])
+@pytest.mark.parametrize("u", [0.3, 1.0, 4.0])
+def test_from_the_range_of_neighbours_on_no_barrier_asks_for_anything(u, lag):
+    """Two at this distance that fly at each other, and wish to accelerate so: their barrier asks for just that."""
+    a, accel = Crowd(2, lag=lag, lift=B).a, 30.0
+    interaction_range = as_python(guard, "stop_distance", "interaction_range")
+    gap = interaction_range(u, accel, a) - 2.0 * RADIUS - 2.0 * u * lag
+    assert needed(gap, -2.0 * u, 0.9 * 2.0 * B, 3.0) == pytest.approx(-2.0 * accel)
+
+
 def test_a_fleet_that_travels_together_keeps_its_list():
     """What all fly together, at a constant speed, renews no list; one that leaves the others does."""
     rng = np.random.default_rng(1)
@@ -449,6 +510,37 @@ def test_a_fleet_that_travels_together_keeps_its_list():
         off[5, axis] += 40.0
         crowd(off, v, np.zeros((12, 3)), t=T)
         assert not np.array_equal(first, crowd.a.listed)
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("seed", range(3))
+def test_neighbours_are_sought_along_the_widest_axis_and_all_are_listed(seed, axis):
+    """Wherever the fleet is: it is in order along this axis, and pairs are as near as a search of all says."""
+    rng = np.random.default_rng(seed)
+    place = [[40.0, -70.0, 5.0], [-9.0, 3.0, 80.0], [0.0, 0.0, 0.0]][seed]
+    r = place + rng.uniform(0.0, 4.0, (12, 3))
+    r[:, axis] += rng.uniform(0.0, 12.0, 12)
+    lost, way = np.zeros(12, dtype=np.bool_), 5.0
+    a = Crowd(12).a
+    neighbours = as_python(guard, "list_neighbours")
+    for _ in range(2):  # unsorted at first
+        assert neighbours(r, lost, way, a)
+        assert (np.diff(r[a.order, axis]) > 0.0).all()
+        near = np.linalg.norm(r[:, None] - r, axis=2) <= way
+        assert sorted(listed(a)) == [(i, j) for i, j in np.argwhere(near) if i != j]
+        r[:2, axis] = r[1::-1, axis]
+
+
+def test_a_list_is_renewed_once_where_all_have_slowed_down():
+    """A list for great speeds holds many: at a fifth of the speed it is made anew, but only once, also at rest."""
+    r, toward = np.array([[0.0, 0.0, 0.0], [30.0, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]] * 2)
+    crowd = Crowd(2, guarded=False)
+    renewed = []
+    for speed in (5.0, 5.0, 4.0, 1.0, 1.0, 0.0, 0.0, 0.0):
+        crowd.a.listed[:] = 7.0 + r  # as if all had moved together, which renews nothing
+        crowd(r, speed * toward, np.zeros((2, 3)))
+        renewed.append(bool((crowd.a.listed == r).all()))
+    assert renewed == [True, False, False, True, False, True, False, False]
 
 
 # -- the barriers --------------------------------------------------------------------------------------
@@ -866,3 +958,18 @@ def test_sweeps_push_all_and_then_those_that_push_until_little_changes(ask):
         assert took == pytest.approx(first, rel=1e-9)
         assert np.r_[a.push, a.pull] == pytest.approx(x, rel=1e-9, abs=1e-12)
     assert np.count_nonzero(x[:count]) > 3 or ask[1] < 0.0
+
+
+@pytest.mark.parametrize("most", [0.5, 1.0, 2.0])
+def test_a_barrier_that_asks_for_more_pushes_as_much_as_it_may(most):
+    """From no push to the greatest at once: what it pushes with is passed on, and so is its change."""
+    n = np.array([[0.6, 0.0, 0.8]])
+    a = SimpleNamespace(
+        rows=np.array([[0, 1]]), normals=n, shift=np.zeros((2, 3)), missing=np.array([99.0]), push=np.zeros(1),
+        reduced=np.array([2.0 / 3.0]), most=np.array([most]), inverse=np.array([1.0, 0.5]),
+    )  # fmt: skip
+    enforce = as_python(barriers, "difference_along", "push_apart", "enforce_barrier")
+    for change in (1.5 * most, 0.0):
+        assert enforce(0, a) == pytest.approx(change)
+        assert a.push == pytest.approx([most])
+        assert a.shift == pytest.approx(np.array([1.0, -0.5])[:, None] * most * n)

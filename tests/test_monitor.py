@@ -1,7 +1,9 @@
 """The monitor on curves made by hand and on short flights, against the same curves and flights sampled densely."""
 
+import ctypes
 import math
 from itertools import combinations
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,9 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rigidfleet as rf
-from rigidfleet.kernel import records
+from rigidfleet.kernel import monitor, records
 from rigidfleet.kernel.engine import native, packing
-from rigidfleet.kernel.problem import Problem
+from rigidfleet.kernel.problem import Problem, graph, workspace
 from rigidfleet.kernel.records import FROM_KNOTS, KNOTS, Trail, bernstein_basis
 from rigidfleet.mission import Mission, load_mission
 
@@ -350,6 +352,133 @@ def test_one_that_moves_alone_changes_its_distances_by_its_way(axis):
 
 
 # -- forces --------------------------------------------------------------------------------------------
+
+
+class Pushed:
+    """Two agents whose thrust, acceleration and constraint force are curves of time, watched over steps.
+
+    ``curves`` takes times (K,) to values (6, K), in the order of a gauge. A recorder of its own gives them.
+    """
+
+    def __init__(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        curves: Any,
+        clock: np.ndarray,
+        rows: int | None = None,
+    ) -> None:
+        self.clock, self.curves, self.evaluated = clock, curves, []
+        problem, state = packing.example_of(Problem), packing.example_of(records.IntegratorState)
+        mass, rows = np.ones(2), rows or len(clock)
+        vehicles = problem.vehicles._replace(m=mass, thrust_limit=np.full(2, np.inf))
+        none = graph(np.zeros((0, 2), dtype=np.int64), mass)
+        self.problem, self.work = problem._replace(vehicles=vehicles, graph=none), workspace(2, 0)
+        self.trail = Trail(
+            np.zeros((rows, 2)), np.zeros((rows, 5, 12)), np.zeros((rows, 6)), np.zeros(6)
+        )
+        self.state = state._replace(trail=self.trail, count=np.zeros_like(state.count))
+        word = ctypes.c_int64
+        self.entry = ctypes.CFUNCTYPE(word, *(word,) * 4)(self.record)
+        address = ctypes.cast(self.entry, ctypes.c_void_p).value
+        monkeypatch.setattr(native, "recorder_address", lambda: address)
+        boxes = np.zeros((0, 6))
+        self.watch = native.Watch(records.new_monitor(np.ones(2), boxes, boxes, 12, 6))
+
+    def at(self, t: float) -> np.ndarray:
+        return self.curves(np.array([t]))[:, 0]
+
+    def record(self, *_: int) -> int:
+        t = float(self.watch.monitor.time[0])
+        self.evaluated.append(t)
+        thrust, a, f = self.at(t).reshape(3, 2)
+        for values, of in ((self.work.f_C, f), (self.work.a, a)):
+            values[:] = 0.0
+            values[:, 1] = of
+        self.work.f_u[:] = -self.work.f_C
+        self.work.f_u[:, 0] += thrust
+        return 0
+
+    def take(self, *cuts: int) -> dict[int, list[float]]:
+        """Watch all steps, of which so many come at a time; values, times and agents of the extremes."""
+        count, done = self.state.count, 0
+        self.trail.start[:] = self.at(self.clock[0, 0])
+        for cut in [*cuts, len(self.clock) - sum(cuts)]:
+            for k in range(done, done + cut):
+                row = (count[records.FIRST_ROW] + count[records.TRAILED]) % len(self.trail.clock)
+                self.trail.clock[row], self.trail.gauge[row] = (
+                    self.clock[k],
+                    self.at(self.clock[k].sum()),
+                )
+                count[records.TRAILED] += 1
+            done += cut
+            last = done == len(self.clock)
+            self.watch.search_forces(self.problem, self.work, self.state, last=last)
+        m = self.watch.monitor
+        assert m.count[records.STAYED] == count[records.TRAILED] == 0
+        return {kind: [-m.worst[kind], m.when[kind], *m.who[kind].tolist()] for kind in PUSHES}
+
+
+PUSHES = records.THRUST, records.ACCELERATION, records.CONSTRAINT_FORCE
+
+
+def hills(at: Any, width: float) -> Any:
+    """Curves (6, K) with a hill each, at times ``at`` (6,), the one of an agent higher than that of the other."""
+    tops = np.array([5.0, 4.0, 2.0, 3.0, 7.0, 6.0])
+
+    def curves(t: np.ndarray) -> np.ndarray:
+        x = (t - np.reshape(at, (-1, 1))) / width
+        return tops[:, None] * (0.5 + 0.5 * np.exp(-x * x))
+
+    return curves
+
+
+@pytest.mark.parametrize("steps", [1, 2, 5])
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.5, 0.7, 0.98])
+def test_the_greatest_forces_are_found_in_whichever_step_they_are(monkeypatch, steps, share):
+    """In the first and the last step as well, which have no neighbour, and wherever the trail is cut.
+
+    Each sort of force has a hill in a step of its own. At the very start or end, a hill shows in the step beside it.
+    """
+    lengths = 0.1 + 0.02 * np.arange(steps)
+    ends = 3.0 + np.cumsum(lengths)
+    clock = np.stack([ends - lengths, lengths], axis=1)
+    inside = np.arange(share < 0.3, steps - (share > 0.7))
+    for first in inside:
+        step = inside[(first + np.array([0, 0, 1, 1, 2, 2])) % len(inside)]
+        at = clock[step, 0] + share * clock[step, 1]
+        whole = Pushed(monkeypatch, hills(at, 0.12), clock)
+        outcome = whole.take()
+        for k, (kind, most, who) in enumerate(zip(PUSHES, (5.0, 3.0, 7.0), (0, 1, 0), strict=True)):
+            value, when, *whom = outcome[kind]
+            assert value == pytest.approx(most, rel=1e-5)
+            assert when == pytest.approx(at[2 * k], abs=1e-2 * lengths[0])
+            assert whom == [who, -1]
+        for cuts in [(1,) * (steps - 1), *((k,) for k in range(1, steps))]:
+            again = Pushed(monkeypatch, hills(at, 0.12), clock, rows=steps if len(cuts) == 1 else 3)
+            assert again.take(*cuts) == outcome
+            assert again.evaluated == whole.evaluated
+
+
+@pytest.mark.parametrize("top", [0.35, 0.2002, 0.1999, 0.2, 0.1])
+@pytest.mark.parametrize("middle", [0.2, 0.5])
+def test_a_parabola_is_searched_at_its_top_and_not_beside_its_middle(top, middle):
+    """The law is evaluated at the top; nearer to the middle than 0.001 of all, there, on the side that has more room.
+
+    What is expected is the rise above the worst value, with that above the middle twice.
+    """
+    start, end, highest, worst = 3.0, 4.0, 8.0, 7.9
+    top, middle = start + top + (middle - 0.2), start + middle
+    a, b, v = (highest - 2.0 * (t - top) ** 2 for t in (start, middle, end))
+    vehicles, graph_of = (
+        SimpleNamespace(m=np.ones(2)),
+        SimpleNamespace(edges=np.zeros((1, 2)), solver=0),
+    )
+    p = SimpleNamespace(vehicles=vehicles, graph=graph_of)
+    excess = getattr(monitor.parabola_excess, "py_func", monitor.parabola_excess)
+    more, at = excess(0, worst, a, b, v, start, middle, end, p, SimpleNamespace(worst=np.zeros(21)))
+    assert more == pytest.approx((2.0 * highest - b - worst) / worst, abs=1e-6)
+    aside = 1e-3 if end - middle > middle - start else -1e-3
+    assert at == pytest.approx(top if abs(top - middle) >= 1e-3 else middle + aside, abs=1e-9)
 
 
 def windy(**tables: Any) -> Mission:

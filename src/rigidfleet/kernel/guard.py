@@ -193,20 +193,21 @@ def interaction_range(u, accel, avoid):
     A barrier asks for nothing while rate h + B s/sqrt(2 B (L - D)) is above the greatest relative acceleration, twice
     that asked for, ``accel`` [m/s^2]; s is at least -2 u.
     """
-    room = stop = strongest = lift = lag = behind = soft = 0.0
+    room = stop = strongest = lag = behind = soft = 0.0
     weakest = math.inf
     for i in range(avoid.b.shape[0]):
         room, lag = max(room, avoid.room[i] + avoid.spare[i]), max(lag, avoid.lag[i])
         behind, soft = max(behind, avoid.lead[i, 0] * u), max(soft, avoid.soft[i])
-        stop, lift = max(stop, stop_distance(u, i, avoid)), max(lift, avoid.lift[i])
+        # After a tick with all its thrust, downwards, it takes far longer to come to rest than before.
+        after = u + avoid.period * avoid.lift[i] + avoid.period * avoid.g
+        stop = max(stop, stop_distance(after, i, avoid) + avoid.period * after)
         weakest, strongest = min(weakest, avoid.b[i]), max(strongest, avoid.b[i])
-    meet = 2.0 * (stop + avoid.period * (u + avoid.period * (lift + avoid.g)))
     barrier = 0.0
     if avoid.filtered:
         half, B = avoid.rate * (u + avoid.share * soft) + accel, 2.0 * avoid.share * strongest
         root = (half + math.sqrt(half * half + 2.0 * avoid.rate * B * u)) / avoid.rate
         barrier = root * root / (4.0 * avoid.share * weakest) + 2.0 * u * lag
-    return 2.0 * (room + behind) + max(meet, barrier)
+    return 2.0 * (room + behind) + max(2.0 * stop, barrier)
 
 
 @jit
