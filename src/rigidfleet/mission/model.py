@@ -401,10 +401,6 @@ class Mission(Contents, Shown):
             del copied.__dict__[name]
         return copied
 
-    def __deepcopy__(self, memo: dict[int, Any] | None = None) -> Self:
-        """A deep copy, also without it: memory that flights of the mission use is not that of others."""
-        return super(Mission, copy(self)).__deepcopy__(memo)
-
     def __getstate__(self) -> dict[Any, Any]:
         """What is pickled: what a copy has, as what was made of the mission may hold functions."""
         return super(Mission, copy(self)).__getstate__()

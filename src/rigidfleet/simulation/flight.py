@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.errors import FlightError, MissionError, StoppedError, wrong_type
 from rigidfleet.kernel.avoidance import with_obstacles
-from rigidfleet.kernel.problem import External, Motion, Workspace, workspace
+from rigidfleet.kernel.problem import External, Motion, workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
@@ -185,20 +185,6 @@ def _first_leg(mission: Mission, anywhere: bool) -> Leg:
     return timed_leg(mission, mission.phases[0], state_at_start(mission), 0, anywhere=anywhere)
 
 
-def _first_plan(mission: Mission, anywhere: bool) -> Leg:
-    """The plan of a mission's first phase that no user's force pushes, also made once; its leg if anything is lost."""
-    leg = part_of_mission(mission, _first_leg, anywhere)
-    disturbance = None if mission.vehicle_models else mission_disturbance(mission)
-    plan = plan_phase(mission, leg, disturbance=disturbance)
-    # What only losses need would hold the mission, which then would not be freed as soon as nobody uses it.
-    return leg if plan.loses else copy_with(plan, damping=None)
-
-
-def _idle_memory(_: Mission) -> dict[str, Callable[..., Workspace]]:
-    """Workspaces of a flight of a mission that has ended, by size, for the next one."""
-    return {}
-
-
 @with_earlier_members(
     arrive="end_phase_if_over", among="replace_obstacles", contact="deepest_contact"
 )
@@ -288,9 +274,7 @@ class Flight:
         # Vehicles meet their disturbances in their own equations of motion.
         self._disturbance = mission_disturbance(mission) if self._vehicles is None else None
         self._extremes = Extremes(mission)
-        # Phases of one size fly in the same memory, as do flights of a mission one after the other.
-        self._idle = part_of_mission(mission, _idle_memory)
-        self._workspaces = self._idle.pop("workspaces", None) or cache(workspace)
+        self._workspaces = cache(workspace)  # phases of one size fly in the same memory
         self._active: ActivePhase | None = None
         self._ended: ActivePhase | None = (
             None  # the phase before, if its last state is not known yet
@@ -407,11 +391,9 @@ class Flight:
                 where = self._state_now, len(self._phases_begun)
                 leg = timed_leg(self.mission, phase, *where, anywhere=evades)
             else:
-                leg = part_of_mission(self.mission, _first_plan, evades)
+                leg = part_of_mission(self.mission, _first_leg, evades)
                 leg = copy_with(leg, before=copy_with(leg.before))
-            if not isinstance(plan := leg, PhasePlan) or self.external is not None:
-                own = {"disturbance": self._disturbance, "external": self._push}
-                plan = plan_phase(self.mission, leg, **own)
+            plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
             self._stop_if_flipped(plan)
             fly = PointPhase
@@ -571,7 +553,6 @@ class Flight:
         if self._ended is not None:  # no phase follows
             self._ended.free_memory()
             self._ended = None
-        self._idle["workspaces"] = self._workspaces
         return self.record(self.pieces, None if own else self._phases_begun)
 
     @property
