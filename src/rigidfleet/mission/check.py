@@ -54,8 +54,8 @@ def default_tables() -> dict[str, Any]:
     }
 
 
-def check_parts(data: Mapping[str, Any], origin: str, validated: Any = None) -> dict[str, Any]:
-    """Check the data of a mission (``validated``: see `FindingCollector`); return its parts, by fields of `Contents`.
+def check_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
+    """Check the data of a mission and return its parts, by the fields of `Contents`.
 
     Raises
     ------
@@ -63,7 +63,6 @@ def check_parts(data: Mapping[str, Any], origin: str, validated: Any = None) -> 
         With a finding for each error.
     """
     m = Draft(data, origin, default_tables())
-    m.validated = {} if validated is None else validated
     m.n = _count_agents(data)
     m.record_breaches((), _count_bound_rules(m))
     if m.findings:  # the other checks would take long

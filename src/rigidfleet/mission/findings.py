@@ -35,16 +35,11 @@ class FindingCollector:
     """Findings about one mission, each at a path of keys in its data.
 
     A path counts from 0, a message from 1: ("phases", 1) is reported as `phases[2]`.
-
-    Attributes
-    ----------
-    validated : table, defaults and model at each path; missions that share tables, as the same objects, share these
     """
 
     def __init__(self, data: Mapping[str, Any], origin: str) -> None:
         self.data = data
         self.origin = origin
-        self.validated: dict[Keys, tuple[Any, Any, Any]] = {}
         self._findings: dict[tuple[str, str], Finding] = {}
         self._counts: Counter[Keys] = Counter()
         self._wrong: set[Keys] = set()
@@ -116,13 +111,9 @@ class FindingCollector:
         if not isinstance(data, dict):
             self.add(path, "must be a table", f"write [{_key_path(path)}] with its keys below it")
             return None
-        before = self.validated.get(path)
-        if before is not None and before[0] is data and before[1] == defaults:
-            return before[2]
-        table, data = data, {**defaults, **data} if defaults else data
+        data = {**defaults, **data} if defaults else data
         try:
-            self.validated[path] = table, defaults, kind.model_validate(data)
-            return self.validated[path][2]
+            return kind.model_validate(data)
         except ValidationError as error:
             errors = error.errors(include_url=False)
         for error in errors:

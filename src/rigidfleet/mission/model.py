@@ -130,19 +130,15 @@ class Mission(Contents, Shown):
         return cls.from_plain(parse_toml(text, origin), origin, text=text)
 
     @classmethod
-    def from_plain(
-        cls, data: dict[str, Any], origin: str, *, text: str = "", validated: Any = None
-    ) -> Self:
+    def from_plain(cls, data: dict[str, Any], origin: str, *, text: str = "") -> Self:
         """Check a mission given as the plain data of its TOML text, as `to_dict` returns it; the mission keeps them.
-
-        Tables that other missions share are ``validated`` once for all of them (`FindingCollector`).
 
         Raises
         ------
         MissionError
             With a finding for each error.
         """
-        parts = check_parts(data, origin, validated)
+        parts = check_parts(data, origin)
         if parts["assignment"] == "each":
             parts["formations"], parts["phases"] = split_shared_formations(
                 parts["formations"], parts["phases"]

@@ -479,7 +479,8 @@ def _slot_blend_rules(p: Shaping, form: Formation, n: int, path: Keys) -> Breach
     """A formation can be reached by blending slots: it has slots, and distances that agree with them."""
     if p.reference != "shape" or form.distances is None:  # without distances, it has slots
         return
-    if (slots := form.slot_array(n)) is None:
+    slots = form.slot_array(n)
+    if slots is None:
         problem = f"formation '{p.formation}' has no slots to blend"
         remedy = "give it a shape or slots, or use reference = 'distances'"
         yield Breach((*path, "reference"), problem, remedy, p.reference)

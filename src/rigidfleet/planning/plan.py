@@ -309,10 +309,12 @@ def _refuse_hopeless_phase(mission: Mission, phase: Phase, start: float, edges: 
             f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it end at"
             f" {start:.2f} s. Give it a duration instead of until"
         )
-    n, solver, shaping = mission.n_agents, mission.constraint.solver, phase.shaping
-    if shaping and (size := solvers.system_size(n, len(edges), solver)) > solvers.MOST_DENSE:
+    if phase.shaping is None:
+        return
+    n, solver = mission.n_agents, mission.constraint.solver
+    if (size := solvers.system_size(n, len(edges), solver)) > solvers.MOST_DENSE:
         raise StoppedError(
-            f"phase '{phase.name}' takes '{shaping.formation}', whose {len(edges):,} edges between"
+            f"phase '{phase.name}' takes '{phase.shaping.formation}', whose {len(edges):,} edges between"
             f' {n:,} agents give {size:,} equations for the constraint force; solver "{solver}" needs'
             f" their eigenvalues; with more than {solvers.MOST_DENSE:,} a flight takes hours. Use solver ="
             ' "iterated" (or "exact"), give it fewer edges, or track slots with edges = []'

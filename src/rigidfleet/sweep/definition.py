@@ -21,7 +21,6 @@ from pydantic import Field, Strict
 
 from rigidfleet._common.arguments import as_path
 from rigidfleet._common.renamed import rename_hint, with_earlier_members
-from rigidfleet._common.toml import to_toml_data
 from rigidfleet._version import __version__
 from rigidfleet.errors import MissionError, RigidfleetError, SweepError, wrong_type
 from rigidfleet.mission import Mission, load_mission, mission_names
@@ -136,7 +135,7 @@ class Sweep:
     ) -> None:
         self.mission, self.variations, self.header = mission, tuple(variations), header
         self.seed, self.name, self.evaluate = header.seed, name, header.evaluate
-        self.drill, self._validated = header.drill, {}
+        self.drill = header.drill
         trials = self.drill.trials if self.drill else 1
         self.runs = header.runs or trials * math.prod(self.grid_sizes.values())
         if self.runs > _RUNS:
@@ -276,9 +275,9 @@ class Sweep:
         tables = (*_SEEDED[:3], ("avoidance", "sensing_noise"))
         return any(look_up(self.document_of_run(0), keys) for keys in tables)
 
-    @cached_property
+    @property
     def mission_document(self) -> dict[str, Any]:
-        """The mission as plain data, as written; the runs share what does not vary."""
+        """The mission as plain data, as written."""
         return self.mission.to_dict()
 
     @cached_property
@@ -316,17 +315,15 @@ class Sweep:
         ]
 
     def document_of_run(
-        self, run: int, values: Sequence[Any] | None = None, whole: dict[str, Any] | None = None
+        self, run: int, values: Sequence[Any] | None = None, mission: Mission | None = None
     ) -> dict[str, Any]:
-        """The mission of a run as plain data, not yet checked; it shares what does not vary.
+        """The mission of a run as plain data, not yet checked.
 
-        ``values`` are those of the run, if they are known; ``whole`` is the mission of the sweep with its ways, if not
-        as written.
+        ``values`` are those of the run, if they are known; ``mission`` is that of the sweep with its ways, if it has
+        some.
         """
-        varied, values = {column.keys for column in self.columns}, values or self.values(run)
-        document = {**(whole or self.mission_document)}
-        for name in document.keys() & {keys[0] for keys in (*varied, *_SEEDED)}:
-            document[name] = to_toml_data(document[name])
+        varied = {column.keys for column in self.columns}
+        document, values = (mission or self.mission).to_dict(), values or self.values(run)
         if self.drill:
             stream = faults.random_stream(self.seed, run, 2)
             faults.apply_fault(document, *values[:2], stream, self.mission.n_agents, self._end_time)
@@ -349,13 +346,14 @@ class Sweep:
         MissionError
             It has errors.
         """
-        with suppress(MissionError):  # errors are told of the mission as written
-            document = self.document_of_run(run, values, self._document_with_ways)
-            return Mission.from_plain(document, f"run {run}", validated=self._validated)
+        if self._mission_with_ways is not self.mission:
+            with suppress(MissionError):  # errors are told of the mission as written
+                document = self.document_of_run(run, values, self._mission_with_ways)
+                return Mission.from_plain(document, f"run {run}")
         return Mission.from_plain(self.document_of_run(run, values), f"run {run}")
 
     @cached_property
-    def _document_with_ways(self) -> dict[str, Any]:
+    def _mission_with_ways(self) -> Mission:
         """The mission with phases for its transitions and ways if nothing that varies matters to them, else as written.
 
         Then they are searched once for all runs. The start is such a key, too.
@@ -363,10 +361,10 @@ class Sweep:
         from rigidfleet.planning.timing import can_affect_plan, expand_mission
 
         if any(can_affect_plan(self.mission, column.keys) for column in self.columns):
-            return self.mission_document
+            return self.mission
         with suppress(MissionError):  # without a way, each run says so
-            return expand_mission(self.mission).to_dict()
-        return self.mission_document
+            return expand_mission(self.mission)
+        return self.mission
 
     @cached_property
     def _end_time(self) -> float:
