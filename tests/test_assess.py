@@ -376,6 +376,38 @@ def test_a_waypoint_is_met_or_missed(what, limit):
         assert found(verdict, f"waypoint_{what}").phase == "WP1"
 
 
+@pytest.mark.parametrize(
+    ("misses", "listed"),
+    [((0.02, 0.05), ["WP2"]), ((0.3, 0.05), ["WP1"]), ((0.3, 0.4), ["WP1", "WP2"])],
+)
+def test_all_waypoints_that_are_missed_are_listed_or_the_one_missed_most(misses, listed):
+    """Of two, each with its miss; and the flight that reached its end is said to at its last sample."""
+    goals = [[1.0, 2.0, 10.0], [3.0, 2.0, 10.0]]
+    phases: list[dict[str, Any]] = [{"kind": "establish", "formation": "triangle", "until": 4.0}]
+    phases += [
+        {"kind": "fly", "position": x, "until": t} for x, t in zip(goals, (7.0, 10.0), strict=True)
+    ]
+    mission = a_mission(TRIANGLE, 3, phases)
+    records = [PhaseRecord("form", "establish", "open", "triangle", 0.0, 4.0)]
+    for k, (start, end) in enumerate([(4.0, 7.0), (7.0, 10.0)]):
+        target = {"time": end, "position": goals[k]} | dict.fromkeys(
+            ("velocity", "attitude", "rates")
+        )
+        records.append(
+            PhaseRecord(f"WP{k + 1}", "fly", "tracking", "triangle", start, end, None, target)
+        )
+    times, phase = [0.0, 4.0, 4.1, 7.0, 7.1, 10.0], [0, 0, 1, 1, 2, 2]
+    triangle = np.broadcast_to(slots(mission, "triangle") + HEIGHT, (6, 3, 3))
+    flight = flown(mission, triangle, time=times, phases=records, phase=phase)
+    for sample, goal, miss in zip((3, 5), goals, misses, strict=True):
+        flight.cm[sample] = np.add(goal, [0.0, miss, 0.0])
+    verdict = assess(flight)
+    points = [c for c in verdict.checks if c.check == "waypoint_position"]
+    assert [c.phase for c in points] == listed
+    assert points[-1].worst == pytest.approx(max(misses))
+    assert found(verdict, "complete").when == 10.0
+
+
 def test_a_waypoint_asks_only_for_what_it_names():
     """A turn has no position, and a flight before a frame is attached no attitude: nothing is judged there."""
     flight = flown(a_mission(TRIANGLE, 3), slots(a_mission(TRIANGLE, 3), "triangle") + HEIGHT)
