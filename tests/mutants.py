@@ -93,6 +93,7 @@ TARGETS = (
             "test_losses.py",
             "test_quantities.py",
             "test_spans.py",
+            "test_vertical.py",
             *_MONITOR[1:],
         ),
         "",

@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
+from sample_flights import quadrotors
 
 from rigidfleet._common.waypoints import SHAPE_TOLERANCE
 from rigidfleet.assessment import Verdict, assess
+from rigidfleet.assessment.checks import all_checks
 from rigidfleet.assessment.fits import Fit, fits_by_sample, shape_of_slots
+from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import CheckResult
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import attitude as att
@@ -238,6 +241,19 @@ def test_a_triangle_upside_down_is_flipped(reference, roll, passes):
     assert failures(verdict) == (set() if passes else {"flip"})
 
 
+@pytest.mark.parametrize(
+    ("flip", "words"), [(90.0, "has not flipped"), (math.nextafter(90.0, 91.0), "has flipped")]
+)
+def test_a_quarter_turn_is_not_yet_flipped(flip, words):
+    """At 90 deg itself the check passes and says so; its words and its outcome are never at odds."""
+    mission = a_mission(TRIANGLE, 3)
+    measured = Measurements(flown(mission, slots(mission, "triangle") + HEIGHT))
+    phases = [replace(p, flip=flip) for p in measured.phase_verdicts()]
+    (check,) = [c for c in all_checks(measured, phases) if c.check == "flip"]
+    assert check.passed == (words == "has not flipped")
+    assert words in check.message
+
+
 @pytest.mark.parametrize(("turn", "noted"), [((0.0, 0.0, 2.0), False), ((math.pi, 0.0, 2.0), True)])
 def test_a_triangle_that_comes_back_upside_down_is_noted(turn, noted):
     """Where nothing commands an attitude, a planar shape that comes back turned over is a note, no failure."""
@@ -376,6 +392,38 @@ def test_a_waypoint_is_met_or_missed(what, limit):
         assert found(verdict, f"waypoint_{what}").phase == "WP1"
 
 
+@pytest.mark.parametrize(
+    ("misses", "listed"),
+    [((0.02, 0.05), ["WP2"]), ((0.3, 0.05), ["WP1"]), ((0.3, 0.4), ["WP1", "WP2"])],
+)
+def test_all_waypoints_that_are_missed_are_listed_or_the_one_missed_most(misses, listed):
+    """Of two, each with its miss; and the flight that reached its end is said to at its last sample."""
+    goals = [[1.0, 2.0, 10.0], [3.0, 2.0, 10.0]]
+    phases: list[dict[str, Any]] = [{"kind": "establish", "formation": "triangle", "until": 4.0}]
+    phases += [
+        {"kind": "fly", "position": x, "until": t} for x, t in zip(goals, (7.0, 10.0), strict=True)
+    ]
+    mission = a_mission(TRIANGLE, 3, phases)
+    records = [PhaseRecord("form", "establish", "open", "triangle", 0.0, 4.0)]
+    for k, (start, end) in enumerate([(4.0, 7.0), (7.0, 10.0)]):
+        target = {"time": end, "position": goals[k]} | dict.fromkeys(
+            ("velocity", "attitude", "rates")
+        )
+        records.append(
+            PhaseRecord(f"WP{k + 1}", "fly", "tracking", "triangle", start, end, None, target)
+        )
+    times, phase = [0.0, 4.0, 4.1, 7.0, 7.1, 10.0], [0, 0, 1, 1, 2, 2]
+    triangle = np.broadcast_to(slots(mission, "triangle") + HEIGHT, (6, 3, 3))
+    flight = flown(mission, triangle, time=times, phases=records, phase=phase)
+    for sample, goal, miss in zip((3, 5), goals, misses, strict=True):
+        flight.cm[sample] = np.add(goal, [0.0, miss, 0.0])
+    verdict = assess(flight)
+    points = [c for c in verdict.checks if c.check == "waypoint_position"]
+    assert [c.phase for c in points] == listed
+    assert points[-1].worst == pytest.approx(max(misses))
+    assert found(verdict, "complete").when == 10.0
+
+
 def test_a_waypoint_asks_only_for_what_it_names():
     """A turn has no position, and a flight before a frame is attached no attitude: nothing is judged there."""
     flight = flown(a_mission(TRIANGLE, 3), slots(a_mission(TRIANGLE, 3), "triangle") + HEIGHT)
@@ -427,6 +475,28 @@ def test_separation_has_a_limit(gap, fails):
     """A separation below the mission's limit fails; exactly the limit holds."""
     verdict = two(gap, separation=0.5)
     assert failures(verdict) == ({"separation"} if fails else set())
+
+
+@pytest.mark.parametrize(
+    ("nearer", "listed"),
+    [((0.02, 0.05), ["b"]), ((0.05, 0.02), ["a"]), ((0.3, 0.05), ["a"]), ((0.3, 0.4), ["a", "b"])],
+)
+def test_phases_nearer_than_planned_are_listed_or_the_one_that_loses_most(nearer, listed):
+    """Of two phases in which agents come nearer than planned, each by so much; 0.1 m are allowed."""
+    phases = [{"kind": "establish", "formation": "line", "duration": 5.0, "name": "a"}]
+    phases.append({"kind": "hold", "duration": 5.0, "name": "b"})
+    mission = a_mission(LINE, 2, phases, agents={"radius": 0.5})
+    proved = [{"separation": 4.0 - 2 * 0.5 + less} for less in nearer]
+    records = [
+        PhaseRecord("a", "establish", "tracking", "line", 0.0, 5.0, planned=proved[0]),
+        PhaseRecord("b", "hold", "tracking", "line", 5.0, 10.0, planned=proved[1]),
+    ]
+    position = slots(mission, "line") + HEIGHT
+    flight = flown(mission, position, phases=records, phase=[0, 0, 1, 1, 1])
+    checks = [c for c in assess(flight).checks if c.check == "separation_as_planned"]
+    assert [c.phase for c in checks] == listed
+    assert checks[-1].worst == pytest.approx(max(nearer))
+    assert [c.passed for c in checks] == [max(nearer) < 0.1] * len(checks)
 
 
 @pytest.mark.parametrize(
@@ -524,6 +594,34 @@ def test_saturated_thrust_is_noted():
     assert other_notes(verdict) == [
         "the thrust of agents 1 and 3 saturates at its limit, first at 2.50 s"
     ]
+
+
+@pytest.mark.parametrize("agent", [0, 1, 2])
+def test_the_rotor_nearest_to_its_limit_names_its_vehicle(agent):
+    """Agents count from 1; the other rotors give half of their limit."""
+    flight = quadrotors(3, 4.0)
+    assert flight.rotor_force is not None
+    flight.rotor_force[:] = 2.5
+    flight.rotor_force[4, agent, LABELS["rotor"].index("rear left")] = 4.5
+    check = found(assess(flight), "rotor_force")
+    assert (check.who, check.worst) == (f"agent {agent + 1}", 4.5)
+    assert f"the rear left rotor of agent {agent + 1} gives up to 4.5 N" in check.message
+
+
+@pytest.mark.parametrize(
+    ("down", "words"), [(1, "1 vehicle"), (2, "2 vehicles"), (3, "3 vehicles")]
+)
+def test_a_landing_counts_who_may_switch_off(down, words):
+    """Of three vehicles, those that stand on the ground at its end; the others are 5 m above."""
+    position = [[3.0 * i, 0.0, 0.25 if i < down else 5.25] for i in range(3)]
+    agents = {"radius": 0.25, "position": position}
+    ground = [{"kind": "ground", "height": 0.0}]
+    mission = a_mission(
+        {}, 3, [{"kind": "land", "duration": 10.0}], agents=agents, obstacles=ground
+    )
+    check = found(assess(flown(mission, position)), "touch_down")
+    assert check.passed
+    assert check.message.endswith(f"; {words} may switch off")
 
 
 @pytest.mark.parametrize(("top", "fails"), [(10.0, False), (9.9, True)])
@@ -707,6 +805,33 @@ def test_a_moment_without_a_sample_is_not_passed():
         "the end of phase 'form' (10.00 s) is not judged: the nearest sample is 1 s"
         in verdict.summary
     )
+
+
+@pytest.mark.parametrize("moment", ["waypoint", "point 1 on the way"])
+def test_a_moment_before_the_end_needs_a_sample_of_its_own(moment):
+    """A sample of the end of the phase shows neither its waypoint nor a point on the way at 6 s."""
+    phases = [
+        {"kind": "establish", "formation": "triangle", "until": 4.0},
+        {"kind": "fly", "position": [1.0, 2.0, 10.0], "until": 10.0},
+    ]
+    mission = a_mission(TRIANGLE, 3, phases)
+    point = {"time": 6.0, "position": [0.0, 0.0, 10.0]} | dict.fromkeys(
+        ("velocity", "attitude", "rates")
+    )
+    target = point if moment == "waypoint" else point | {"time": 10.0, "through": [point]}
+    records = [
+        PhaseRecord("form", "establish", "open", "triangle", 0.0, 4.0),
+        PhaseRecord("WP1", "fly", "tracking", "triangle", 4.0, 10.0, None, target),
+    ]
+    triangle = slots(mission, "triangle") + HEIGHT
+    for near, missing in [(6.0, False), (6.005, False), (6.2, True)]:
+        times = [0.0, 4.0, 4.1, near, 10.0]
+        verdict = assess(
+            flown(mission, triangle, time=times, phases=records, phase=[0, 0, 1, 1, 1])
+        )
+        assert failures(verdict) == ({"samples"} if missing else set())
+    words = f"the {moment} of phase 'WP1' (6.00 s) is not judged: the nearest sample is 0.2 s"
+    assert found(verdict, "samples").message.startswith(words)
 
 
 @pytest.mark.parametrize("left_by", ["a loss", "the end of the flight"])
