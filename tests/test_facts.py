@@ -308,7 +308,8 @@ def numbers_wanted(data: Any, show: bool) -> dict[tuple[str, str], list[float]]:
         force = max(gains["force_per_error_n_m"].values()) / 100
         numbers = [gains["margin"], gains["settling_time_s"], 100 * gains["overshoot"], force]
         wanted["gains", "stable"] = numbers
-    margins: dict[str, Any] = data["margins"] or {"tracking": None, "formations": {}}
+    # Of a show, margins are shown only where one is unstable.
+    margins: dict[str, Any] = (not show and data["margins"]) or {"tracking": None, "formations": {}}
     own = {"tracking": margins["tracking"]} if margins["tracking"] else {}
     for where, m in (own | margins["formations"]).items():
         numbers = [1e3 * m["delay_s"], m["phase_deg"], *m["gain"], m.get("largest_p")]

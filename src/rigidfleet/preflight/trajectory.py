@@ -149,7 +149,7 @@ def find_planned_peaks(mission: Mission, preflight: Preflight) -> None:
     for limit in limits_of(mission, unlimited=WORST_SHOWN):
         q, way = limit.of, preflight.planned_phases
         if q.order == 3 or q.name == "tilt":
-            way = [planned for planned in way if planned.leg.phase.control == "tracking"]
+            way = [planned for planned in way if planned.leg.phase.tracks_slots]
         if way:
             states = (_planned_states(planned, q.order) for planned in way)
             values = [limit.values(x, np.arange(mission.n_agents)) for x in states]
