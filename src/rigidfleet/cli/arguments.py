@@ -21,6 +21,7 @@ Workers = Annotated[
 ]
 
 
+# Not `mission_names`, whose package takes long to load.
 _SHIPPED = sorted(path.stem for path in Path(__file__).parents[1].glob("missions/*.toml"))
 #: A file, or the name of a shipped mission, which a shell completes.
 MissionName = Annotated[Literal[tuple(_SHIPPED)] | str, Parameter(show_choices=False)]  # ty: ignore[invalid-type-form]

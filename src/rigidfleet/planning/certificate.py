@@ -16,8 +16,6 @@ from rigidfleet.typing import Bools, Floats
 
 #: What a certificate of bent ways gives away, so that its search ends [m].
 CLOSE = 1e-6
-#: Number of vehicles up to which all pairs are compared at once.
-_FEW = 100
 #: Shares of a blend's duration, and of the paths flown by then.
 _TAU = np.linspace(0.0, 1.0, 2001)
 _FLOWN = septic_polynomial(_TAU)
@@ -84,12 +82,8 @@ def prove_blend(reference: Reference, radius: Floats) -> Certificate:
     p, dp, time, share = reference.p0, reference.dp, reference.t0, 0.0
     if dp.any():
         separation, pair, share = closest_approach(p, p + dp, radius)
-    elif len(p) > _FEW:
-        (separation,), (pair,) = (x.tolist() for x in proximity.separation(p[None], radius))
     else:
-        i, j = pairs = proximity.all_pairs(len(p))
-        gaps = proximity.root_of_squares((p[j] - p[i]).T) - (radius[i] + radius[j])
-        separation, pair = float(gaps.min()), pairs[:, gaps.argmin()].tolist()
+        (separation,), (pair,) = (x.tolist() for x in proximity.separation(p[None], radius))
     if share > 0.0:
         time += reference.T_b * float(np.interp(share, _FLOWN, _TAU))
     return Certificate(separation, time, tuple(pair), "closed form")
