@@ -82,8 +82,8 @@ def test_rewards_are_errors_of_edges_and_slots():
     rng = np.random.default_rng(1)
     for _ in range(20):
         _, rewards, *_ = env.step({a: rng.uniform(-1, 1, 3).astype(np.float32) for a in env.agents})
-    active: Any = env.flight.under_way()
-    r = active.sampled.S[:, :3]
+    vehicles: Any = env.flight.under_way().propagator
+    r = vehicles.sampled.S[:, :3]
     slots = np.array(SLOTS) - np.average(SLOTS, axis=0, weights=[1, 2, 3])
     slots += np.average(np.array(env.flight.mission.agents.position), axis=0, weights=[1, 2, 3])
 

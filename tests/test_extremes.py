@@ -510,7 +510,7 @@ def test_extremes_of_a_large_formation_depend_on_no_pause_and_no_sample(monkeypa
     """Whether the integrator pauses after each step or hardly ever, and whatever is recorded: the same to the bit."""
     every = [simulate(a_sphere()), simulate(a_sphere(), times=[0.0, 1.0])]
     for name in ("_FIRST_STEPS", "_FIRST_NUMBERS", "_STEPS"):
-        monkeypatch.setattr(f"rigidfleet.simulation.point_phase.{name}", 1)
+        monkeypatch.setattr(f"rigidfleet.simulation.point_propagator.{name}", 1)
     every.append(simulate(a_sphere()))
     found = [[p.extremes for p in result.phases] for result in every]
     assert found[0] == found[1] == found[2]

@@ -346,8 +346,8 @@ def test_the_memory_of_a_phase_is_free_when_the_next_one_flies():
         flown.begin()
         while flown.advance(1.0):
             pass
-        active = flown._ended
-        assert active is not None
+        assert flown._ended is not None
+        active = flown._ended.integration
         assert active.solver is not None
         kept = [weakref.ref(x) for x in (active.solver, active.workspace.r.base)]
         kept += [
@@ -439,7 +439,7 @@ def test_velocities_are_held_to_what_places_are():
 def test_large_formations_do_not_creep_into_a_phase(monkeypatch):
     """Their first step is found from two evaluations: fewer steps, and the same flight."""
     found = simulate(flight("exact", "henneberg"))
-    monkeypatch.setattr("rigidfleet.simulation.point_phase.first_step", lambda *_: 1e-3)
+    monkeypatch.setattr("rigidfleet.simulation.point_propagator.first_step", lambda *_: 1e-3)
     crept = simulate(flight("exact", "henneberg"))
     assert found.statistics["steps"] <= crept.statistics["steps"] - 2
     assert found.statistics["rejected"] <= crept.statistics["rejected"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,25 +11,18 @@ from rigidfleet.kernel.records import ACCEPTED, NEXT_STEP, REJECTED
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.planning import solvers
 from rigidfleet.planning.plan import PhasePlan
+from rigidfleet.simulation.plan_integration import PlanIntegration
 from rigidfleet.typing import Floats
-
-if TYPE_CHECKING:
-    from rigidfleet.simulation.active_phase import ActivePhase
 
 #: What to do about distance errors that no feedback corrects.
 _FEEDBACK = '; without feedback, errors grow: stabilisation = "pid" corrects them'
 
 
-def diagnose(at: ActivePhase, *, own_force: bool, collapsed: bool) -> str:
+def diagnose(at: PlanIntegration, *, collapsed: bool) -> str:
     """Say when, where and why the integrator could not go on, and what to try.
 
-    ``own_force``: whether a user's force function acts on the agents; ``collapsed``: whether the step size has
-    collapsed (otherwise there were too many steps).
+    ``collapsed``: whether the step size has collapsed (otherwise there were too many steps).
     """
-
-    def remedy() -> str:
-        return _remedy(at, own_force=own_force, collapsed=collapsed)
-
     count, h = at.state.count, float(at.state.clock[NEXT_STEP])
     if collapsed:
         what = f"the step size has fallen to {h:.1g} s"
@@ -38,12 +30,12 @@ def diagnose(at: ActivePhase, *, own_force: bool, collapsed: bool) -> str:
         what = f"{count[ACCEPTED] + count[REJECTED]} steps have been taken, the last of {h:.1g} s"
     head = f"the flight cannot go on at t = {at.t:.3f} s, in phase '{at.plan.phase.name}': {what}"
     if not len(at.plan.edges):
-        return f"{head}. {remedy()}"
+        return f"{head}. {_remedy(at, collapsed=collapsed)}"
     if at.solver is not None:
         lost, failed = at.solver.counts.fallbacks, at.solver.counts.failures
         return (
             f"{head}; the multipliers are solved by {solvers.WORDS[at.plan.method]}, which lost a pivot"
-            f" {lost} times and found no solution {failed} times. {remedy()}"
+            f" {lost} times and found no solution {failed} times. {_remedy(at, collapsed=collapsed)}"
         )
     J, closest, length = _jacobian_and_shortest_edge(at)
     edge = "-".join(str(int(a) + 1) for a in at.plan.edges[closest])
@@ -67,7 +59,7 @@ def diagnose(at: ActivePhase, *, own_force: bool, collapsed: bool) -> str:
             f'{head}, and {where}. The force of solver "{solver}" has {bound} where a singular value'
             f' vanishes. Use solver = "iterated" (or "spectral"){_unbounded_law_advice(at.plan)}'
         )
-    return f"{head}, and {where}. {remedy()}"
+    return f"{head}, and {where}. {_remedy(at, collapsed=collapsed)}"
 
 
 def _unbounded_law_advice(plan: PhasePlan) -> str:
@@ -82,14 +74,14 @@ def _unbounded_law_advice(plan: PhasePlan) -> str:
     return words
 
 
-def _remedy(at: ActivePhase, *, own_force: bool, collapsed: bool) -> str:
+def _remedy(at: PlanIntegration, *, collapsed: bool) -> str:
     """What to try if J is not the cause."""
     beyond = at.t + 1e-9 * max(1.0, at.t)  # a jump at at.t shows only after it
     native.closed_loop(beyond, at.state.y, np.empty_like(at.state.y), at.plan.problem, at.workspace)
     w = at.workspace
     names = {"input force": w.f_u, "constraint force": w.f_C, "external force": w.f_E}
     lost = [name for name, f in names.items() if not np.isfinite(f).all()]
-    if "external force" in lost and own_force:
+    if "external force" in lost and at.external is not None:
         bad = np.flatnonzero(~np.isfinite(w.f_E).all(axis=1))
         return f"Your own force is not finite on agent {bad[0] + 1}: correct its function"
     if lost:
@@ -115,7 +107,7 @@ def _remedy(at: ActivePhase, *, own_force: bool, collapsed: bool) -> str:
     )
 
 
-def _jacobian_and_shortest_edge(at: ActivePhase) -> tuple[Floats, int, float]:
+def _jacobian_and_shortest_edge(at: PlanIntegration) -> tuple[Floats, int, float]:
     """J (m, 3N) at the integrator's state, the shortest edge and its length [m]."""
     edges = at.plan.edges
     native.closed_loop(at.t, at.state.y, np.empty_like(at.state.y), at.plan.problem, at.workspace)

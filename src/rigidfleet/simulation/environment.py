@@ -21,7 +21,7 @@ from rigidfleet.planning.vehicles import network_of
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.flight import Flight
 from rigidfleet.simulation.own_laws import View
-from rigidfleet.simulation.sampled_phase import SampledPhase
+from rigidfleet.simulation.sampled_propagator import SampledPropagator
 from rigidfleet.typing import Floats
 
 Vector = NDArray[np.float32]
@@ -175,17 +175,17 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
 
     def _observations(self, active: ActivePhase) -> dict[str, Vector]:
         """Observations of all vehicles that fly."""
-        assert isinstance(active, SampledPhase)
-        views = [view for view in active.views_of_laws() if view is not None]
+        assert isinstance(active.propagator, SampledPropagator)
+        views = [view for view in active.propagator.views_of_laws() if view is not None]
         return {self.possible_agents[view.agent]: self.observation(view) for view in views}
 
     def _rewards(self, active: ActivePhase) -> dict[str, float]:
         """Rewards of all vehicles, at their true states."""
-        w, n = active.workspace, len(self.possible_agents)
-        assert isinstance(active, SampledPhase)
-        r, edge = active.sampled.S[:, :3], active.sampled.mail.edge
+        w, n, flown = active.integration.workspace, len(self.possible_agents), active.propagator
+        assert isinstance(flown, SampledPropagator)
+        r, edge = flown.sampled.S[:, :3], flown.sampled.mail.edge
         held = edge >= 0
-        i, j = active.flight.network.links[held].T
+        i, j = flown.flight.network.links[held].T
         apart = r[i] - r[j]
         off = np.abs(np.sqrt((apart * apart).sum(axis=1)) - w.d[edge[held]])
         error = np.bincount(i, off, n) / np.maximum(np.bincount(i, minlength=n), 1)

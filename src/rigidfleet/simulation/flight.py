@@ -28,7 +28,7 @@ from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, Pose, copy_with
 from rigidfleet.planning.timing import complete_times, timed_leg
 from rigidfleet.result import Extremum, PhaseRecord, Result
-from rigidfleet.simulation.active_phase import ActivePhase, Sampler
+from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.as_flown import check_formation_exists, mission_as_flown, phase_of_table
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
@@ -41,9 +41,10 @@ from rigidfleet.simulation.callbacks import (
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.leading import layers
 from rigidfleet.simulation.own_laws import Law
-from rigidfleet.simulation.point_phase import PointPhase
+from rigidfleet.simulation.plan_integration import PlanIntegration, Sampler
+from rigidfleet.simulation.point_propagator import PointPropagator
 from rigidfleet.simulation.recording import Piece, assemble_result
-from rigidfleet.simulation.sampled_phase import FleetState, SampledPhase
+from rigidfleet.simulation.sampled_propagator import FleetState, SampledPropagator
 from rigidfleet.simulation.sampling import Sampling, requested_times
 from rigidfleet.solids.records import join_solids
 from rigidfleet.typing import Floats
@@ -323,7 +324,7 @@ class Flight:
         """Pose of the virtual body: its reference if slots are tracked, otherwise the agents' own frame."""
         active = self.under_way()
         active.evaluate_law_now()
-        w, plan = active.workspace, active.plan
+        w, plan = active.integration.workspace, active.plan
         if plan.problem.control.tracks_slots:
             return Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
         return Pose(w.cm[0].copy(), w.cm[1].copy(), w.T.copy(), np.zeros(3))
@@ -396,14 +397,14 @@ class Flight:
             plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
             self._stop_if_flipped(plan)
-            fly = PointPhase
-            if self._vehicles is not None:
-                fly = partial(SampledPhase, vehicles=self._vehicles)
-            self._active = fly(
-                len(self.phases), plan, extremes=self._extremes, external=self.external,
-                sampler=self.sampler, pieces=self.pieces, pause=lambda _: self._report_progress(phase),
-                workspaces=self._workspaces,
+            at = PlanIntegration(
+                len(self.phases), plan, self._extremes, self.external, self.sampler, self.pieces,
+                partial(self._report_progress, phase), self._workspaces,
             )  # fmt: skip
+            vehicles = self._vehicles
+            self._active = ActivePhase(
+                PointPropagator(at) if vehicles is None else SampledPropagator(at, vehicles)
+            )
         except MissionError as error:
             # Only where a flight leaves it open can a phase of the mission be impossible: the rest are errors.
             if by_hand or not (phase.auto_keys or phase.follows_curves):
@@ -447,8 +448,9 @@ class Flight:
         if duration is not None and not duration > 0.0:
             raise ValueError(f"the duration must be positive [s], not {duration!r}")
         plan = active.plan
-        active.stop = min(math.inf if duration is None else active.t + duration, self._loss_time())
-        t_end, settle = min(active.stop, plan.t_end), plan.phase.settle
+        stop = min(math.inf if duration is None else active.t + duration, self._loss_time())
+        active.integration.stop = stop
+        t_end, settle = min(stop, plan.t_end), plan.phase.settle
         try:
             if settle is None:
                 active.fly_to(t_end, self.controller, self.rate)
@@ -511,7 +513,7 @@ class Flight:
             feedback = problem.feedback._replace(
                 arrival=t, r=start.r, v=start.v, T1=np.ascontiguousarray(start.T), omega=start.omega
             )
-            active.switch_problem_by_hand(problem._replace(feedback=feedback, external=external))
+            active.propagator.take_up(problem._replace(feedback=feedback, external=external))
             return
         (r, v, a_end), (phi, omega, alpha_end) = end, turn
         zero = np.zeros(3)
@@ -522,7 +524,7 @@ class Flight:
         times = np.array([t, t + h])
         pieces = np.ascontiguousarray(lqr.quintic_pieces(times, x, x_dot, x_ddot))
         motion = Motion(times, pieces, np.ascontiguousarray(start.T))
-        active.switch_problem_by_hand(problem._replace(motion=motion, external=external))
+        active.propagator.take_up(problem._replace(motion=motion, external=external))
 
     def finish(self, ending: str = "") -> Result:
         """End the flight; return its record.
@@ -576,7 +578,7 @@ class Flight:
         """The record of samples, of the mission's own phases or of the phases ``flown`` instead."""
         active = self._active
         if active is not None:  # the flight can go on
-            active.search_extremes(last=True)
+            active.search_extremes()
             self.phases[-1].extremes = self._extremes.extremes_so_far()
         mission, phases = self.mission, self.phases
         if flown is not None:
@@ -610,7 +612,7 @@ class Flight:
         `mission` has them from now on, its text has not.
         """
         if self._active is not None:
-            self._active.search_extremes(last=True)
+            self._active.search_extremes()
         self.mission = self.mission.model_copy(update={"obstacles": tuple(obstacles)})
         self._extremes.replace_obstacles(obstacles)
         vehicles = self._vehicles
@@ -621,7 +623,7 @@ class Flight:
     def deepest_contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far, with vehicle and obstacle, or None."""
         if self._active is not None:
-            self._active.search_extremes(last=True)
+            self._active.search_extremes()
         return self._extremes.deepest_contact()
 
     # -- inside -----------------------------------------------------------------------------------
@@ -703,24 +705,22 @@ class Flight:
             return
         if not (active.has_settled or active.is_over or abandoned):
             self._cut.add(len(self.phases) - 1)
-        active.search_extremes(last=True)
-        record = self.phases[-1]
+        active.search_extremes()
+        at, record = active.integration, self.phases[-1]
         record.extremes = self._extremes.end_phase()
         record.abandoned = abandoned
         record.controller = (
             None if self._built_in else self.controller is None or active.control_calls > 0
         )
-        if active.event_delay > 0.0:
-            record.target = active.plan.target_record
+        record.target = active.plan.target_record  # clocks that wait put it off
         record.settled = None if abandoned else active.has_settled
-        active.count_work()
-        self._count += active.counted
-        for method, counts in active.solves:
+        at.count_work()
+        self._count += at.counted
+        for method, counts in at.solves:
             self._solves.setdefault(method, type(counts)()).add(counts)
         self._ended = active
         self._t = record.t_end = active.t
-        if active.solver is not None:  # its errors are told at once
-            active.raise_errors()
+        at.raise_errors()  # told at once
         if abandoned:
             points = () if record.target is None else record.target.get("through", ())
             came = [point for point in points if point["time"] <= record.t_end]

@@ -16,7 +16,7 @@ from rigidfleet.mission import Mission
 from rigidfleet.result import Result
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.flight import Flight, simulate
-from rigidfleet.simulation.point_phase import PointPhase
+from rigidfleet.simulation.point_propagator import PointPropagator
 
 if TYPE_CHECKING:
     from rigidfleet.kernel.engine import batch  # imports the compiler
@@ -53,7 +53,7 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
         if not any(going):
             return [flight.finish() for flight in flights]
         active = [flight.under_way() for flight, goes in zip(flights, going, strict=True) if goes]
-        points = [x for x in active if isinstance(x, PointPhase)]
+        points = [x.propagator for x in active if isinstance(x.propagator, PointPropagator)]
         if all(going) and len(points) == len(active) and _can_share_steps(active):
             if vector is None:
                 from rigidfleet.kernel.engine import batch
@@ -81,35 +81,36 @@ def _can_share_steps(active: Sequence[ActivePhase]) -> bool:
 
 def _allows_common_steps(phase: ActivePhase) -> bool:
     """Whether a phase has a given duration, without losses, calls of users' functions, fences and people."""
-    plan = phase.plan
+    plan, at = phase.plan, phase.integration
     return (
-        not phase.extremes.boundaries.every
+        not at.extremes.boundaries.every
         and plan.phase.settle is None
-        and phase.solver is None
-        and phase.external is None
+        and at.solver is None
+        and at.external is None
         and not plan.loses
     )
 
 
 def _sharing_key(phase: ActivePhase) -> tuple[object, ...]:
     """What phases that share steps have in common: when they are flown and recorded, and sizes of arrays."""
-    plan, extremes = phase.plan, phase.extremes
+    plan, at = phase.plan, phase.integration
     points = tuple(at["time"] for at in plan.through)
     times = plan.start, plan.t_end, plan.arrival, points
-    return *times, plan.integrator.rtol, len(phase.state.y), extremes.directed
+    return *times, plan.integrator.rtol, len(at.state.y), at.extremes.directed
 
 
-def _fly_in_common_steps(active: Sequence[PointPhase], vector: batch.Vector) -> bool:
-    """Fly phases to their end in common steps and record them; return whether they came there."""
+def _fly_in_common_steps(points: Sequence[PointPropagator], vector: batch.Vector) -> bool:
+    """Fly phases of points to their end in common steps and record them; return whether they came there."""
     from rigidfleet.kernel.engine.tracer import UnfitError
 
-    t_end = active[0].plan.t_end
-    times = active[0].sample_times(t_end)
-    stretches = [phase.prepare_stretch(phase.plan.problem, times) for phase in active]
+    first = points[0].integration
+    t_end = first.plan.t_end
+    times = first.sample_times(t_end)
+    stretches = [one.prepare_stretch(one.integration.plan.problem, times) for one in points]
     try:
         vector.begin(
             _fill_lanes([stretch.problem for stretch in stretches]),
-            _fill_lanes([phase.state for phase in active]),
+            _fill_lanes([one.integration.state for one in points]),
             t_end,
             times,
             _fill_lanes([stretch.samples for stretch in stretches]),
@@ -120,12 +121,12 @@ def _fly_in_common_steps(active: Sequence[PointPhase], vector: batch.Vector) -> 
     while status == records.PAUSED:
         status = vector(_STEPS)
         if status == records.PAUSED:
-            for phase in active:
-                phase.search_extremes(last=False)
-            if active[0].has_stalled():
+            for one in points:
+                one.search_extremes(last=False)
+            if points[0].has_stalled():
                 return False
-    for phase, stretch in zip(active, stretches, strict=True):
-        phase.record_samples(stretch)
+    for one, stretch in zip(points, stretches, strict=True):
+        one.record_samples(stretch)
     return status == records.FINISHED
 
 

@@ -1,10 +1,8 @@
-"""A phase flown by vehicles with sampled control: integrates their motion between the ticks of their autopilots."""
+"""Vehicles with sampled control: their motion is integrated between the ticks of their autopilots."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -21,11 +19,8 @@ from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.planning.avoidance import avoidance_in_flight
 from rigidfleet.planning.derivatives import slots_by_own_clocks
-from rigidfleet.planning.plan import PhasePlan
-from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.vehicles import (
     TickTables,
-    YawTurn,
     gilbert_transitions,
     initial_yaw,
     sampled_flight,
@@ -33,17 +28,16 @@ from rigidfleet.planning.vehicles import (
 )
 from rigidfleet.planning.virtual_clock import postpone
 from rigidfleet.result import Extremum
-from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
     Command,
-    Observation,
     article_and_kind,
     check_command,
 )
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.leading import Leader, layers
 from rigidfleet.simulation.own_laws import Law, OwnLaws, View
+from rigidfleet.simulation.plan_integration import PlanIntegration
 from rigidfleet.simulation.recording import LayerSamples, VehicleSamples
 from rigidfleet.typing import Floats
 
@@ -99,24 +93,25 @@ class FleetState:
         self.flight = self.flight._replace(network=network)
 
 
-class SampledPhase(ActivePhase):
-    """A phase under way that vehicles with sampled control fly, between the ticks of their autopilots.
+class SampledPropagator:
+    """Vehicles with sampled control in flight: a `Propagator` by steps of one length between the ticks of autopilots.
 
-    The law of the plan is evaluated at measured states, at ticks. Whenever the kernel returns, ``state.y`` holds the
-    true state, in the layout of the continuous flight.
+    The law of the plan is evaluated at measured states, at ticks. Whenever the kernel returns, ``state.y`` of the
+    integration holds the true state, in the layout of the continuous flight.
     """
 
-    by_ticks = True
-    turn: YawTurn
+    control_start = 0.0  # as that of ticks
 
-    def __init__(self, index: int, plan: PhasePlan, *, vehicles: FleetState, **around: Any) -> None:
-        self.vehicles, self.flight = vehicles, vehicles.flight
+    def __init__(self, integration: PlanIntegration, vehicles: FleetState) -> None:
+        plan = integration.plan
+        self.integration, self.vehicles, self.flight = integration, vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
         if vehicles.avoidance is not None:
             vehicles.avoidance = avoidance.for_next_phase(vehicles.avoidance)
         self.by_pieces = False  # whether the reference is given piece by piece
         self.steered = False  # whether it is given by hand
         self.decided_until = -math.inf  # end of what the leader has decided [s]
+        self.flown: Problem | None = None  # the problem of the steps in the trail
         self.unjudged = False  # whether steps were flown since the extremes of vehicles were taken
         self.first_tick: int | None = None
         self.leader: Leader | None = None
@@ -124,32 +119,30 @@ class SampledPhase(ActivePhase):
             period = self.flight.every * self.flight.steps * self.flight.h
             self.leader = Leader(vehicles.layers, plan, period)
             self.leader.deviation.scale = vehicles.scale
+        #: How vehicles turn about the vertical.
         self.turn = yaw_turn_from(plan.problem, plan.start, vehicles.tables.yaw, vehicles.yaw)
         #: When own clocks were last looked at, and by how much they were late then [s].
         self.late = plan.start, 0.0
         self.slowed: tuple[float, int] | None = None  # when they first waited [s], and for whom
-        super().__init__(index, plan, **around)
 
     def begin(self, y: Floats, t: float) -> None:
         """Begin to fly at a state (n,) and time [s]; vehicles go on from the states that they have."""
-        super().begin(y, t)
-        plan, fleet_state = self.plan, self.vehicles
+        at, plan, fleet_state = self.integration, self.integration.plan, self.vehicles
         n, m = len(plan.masses), len(plan.edges)
-        rtol, atol = plan.integrator.rtol, plan.tolerances
-        self.state = self.extremes.begin_monitoring(y, t, m, rtol=rtol, atol=atol, states=6 * n)
-        lost = self.flight.vehicles._replace(lost=self.lost.copy())
+        at.begin(y, t, states=6 * n)
+        lost = self.flight.vehicles._replace(lost=plan.before.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
         integral, before = y[6 * n : 6 * n + m], fleet_state.state
         law = plan.problem.law
         begun = fleet.initial_state(
-            self.flight, fleet_state.S, self.workspace, frame=frame,
+            self.flight, fleet_state.S, at.workspace, frame=frame,
             iterations=law.iterations if law.solver == ITERATED else 1,
         )  # fmt: skip
         if before is None:
             begun.integral[:] = integral
         else:
-            renewed = fleet.state_under_problem(before, self.workspace, integral, frame=frame)
+            renewed = fleet.state_under_problem(before, at.workspace, integral, frame=frame)
             if self.first_tick is None:  # extremes are those of the phase, also after a loss in it
                 fresh = ("peak", "peak_time", "worst", "worst_time", "saturations")
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
@@ -157,7 +150,7 @@ class SampledPhase(ActivePhase):
         # Edges that end within a phase are those of what is lost.
         lose = self.first_tick is not None
         give_edges_to_links(self.flight.network, begun.mail, plan.edges, integral, lose=lose)
-        trail = self.state.trail
+        trail = at.state.trail
         self.sampled = fleet_state.state = begun._replace(
             trail=trail._replace(gauge=trail.gauge[:, :0])
         )
@@ -165,21 +158,18 @@ class SampledPhase(ActivePhase):
             fleet_state.avoidance = avoidance.with_edges(fleet_state.avoidance, m)
         if self.first_tick is None:
             self.first_tick = int(begun.count[fleet.TICKS])
-            self.gone = self.lost.copy()  # (N,) vehicles that do not fly in this phase
+            self.gone = plan.before.lost.copy()  # (N,) vehicles that do not fly in this phase
             begun.peak_time[:] = begun.worst_time[:] = t
         self.tabled = None
         self.steps_taken_over = int(begun.count[fleet.STEPS])  # those of the flight before
 
     # -- flying -----------------------------------------------------------------------------------
 
-    def lead_reference(self, *, by_law: bool) -> float:
-        """Let the layers above the barriers lead the reference, if there are any; returns until when that holds [s]."""
-        leader, arrays = self.leader, self.vehicles.avoidance
-        if self.flight.clocks.own:
-            return (math.floor(self.t / _STRETCH + 1e-6) + 1.0) * _STRETCH
-        if leader is None or arrays is None or not by_law or self.steered:
+    def _lead_reference(self) -> float:
+        """Let the layers above the barriers lead the plan's reference, if there are any; until when that holds [s]."""
+        leader, arrays, t = self.leader, self.vehicles.avoidance, self.integration.t
+        if leader is None or arrays is None or self.steered:
             return math.inf
-        t = self.t
         end = leader.end_of_period(t, self.vehicles.output_step)
         if t >= self.decided_until:
             self.decided_until = end
@@ -189,17 +179,13 @@ class SampledPhase(ActivePhase):
         return self.decided_until
 
     @property
-    def event_delay(self) -> float:
-        """Time by which the events of the phase come later than planned [s]."""
-        return self.late[1] if self.leader is None else self.leader.clock.delay
-
-    @property
     def lateness(self) -> float:
         """Time by which the plan's references are behind now, in the mean of the clocks of vehicles that fly [s]."""
         if not self.flight.clocks.own:
             return 0.0
         tau, ticks = self.sampled.tau[~self.flight.vehicles.lost], self.sampled.count[fleet.TICKS]
-        since = self.t - max(ticks - 1, 0) * self._tick_duration  # clocks run on between ticks
+        # Clocks run on between ticks
+        since = self.integration.t - max(ticks - 1, 0) * self._tick_duration
         return float(-(tau[:, OFF] + since * (tau[:, RATE] - 1.0)).mean())
 
     @property
@@ -208,7 +194,7 @@ class SampledPhase(ActivePhase):
 
     def _postpone_plan_events(self) -> None:
         """Move the events of the plan that have not come yet by what own clocks are late."""
-        plan, t, (t_before, before) = self.plan, self.t, self.late
+        plan, t, (t_before, before) = self.integration.plan, self.integration.t, self.late
         late = max(0, round(self.lateness / self._tick_duration)) * self._tick_duration
         self.late = t, late
 
@@ -223,59 +209,58 @@ class SampledPhase(ActivePhase):
         if self.slowed is None and (self.sampled.tau[:, PACE] < _SLOWED).any():
             self.slowed = t, int(self.sampled.tau[:, WORST].argmax())
 
-    def switch_problem_by_hand(self, problem: Problem) -> None:
-        """Take up a problem that was made by hand: the layers above the barriers then rest."""
+    def take_up(self, problem: Problem) -> None:
+        """Make a problem that was made by hand the plan's: the layers above the barriers then rest."""
         self.steered = True
         if self.leader is not None:
             self.leader.now = None
         self._continue_with(problem)
 
     def _continue_with(self, problem: Problem) -> None:
-        """Continue with another problem; vehicles that turn along their way do so from the yaw they have now."""
-        tables, t = self.vehicles.tables, self.t
+        """Make another problem the plan's; vehicles that turn along their way do so from the yaw they have now."""
+        tables, plan, t = self.vehicles.tables, self.integration.plan, self.integration.t
         if tables.yaw.kind == "along":
-            now = tables.yaw_at(self.plan.problem, t, self.turn)
+            now = tables.yaw_at(plan.problem, t, self.turn)
             self.turn = yaw_turn_from(problem, t, tables.yaw, now)
         self.by_pieces = True
-        super().switch_problem_by_hand(problem)
+        plan.problem = problem
 
-    def observe(self) -> Observation:
-        """What a controller sees: states of now or, with noise, as the law knows them at a tick and until the next."""
-        observation, S = super().observe(), self.sampled.S
+    def states_seen(self) -> dict[str, Floats]:
+        """States of now or, with noise, as the law knows them at a tick and until the next."""
+        S = self.sampled.S
         seen = S[:, :6]
         if self.vehicles.tables.noise is not None:
             self._measure_if_due()
             tables, tick = self.flight.tables, self.sampled.count[fleet.STEPS] // self.flight.steps
             # About the path of that tick, if there are any
             seen = self.sampled.seen + tables.path[max(tick - tables.first, 0) :][:1].sum(axis=0)
-        return replace(
-            observation, position=seen[:, :3].copy(), velocity=seen[:, 3:].copy(), attitude=S[:, 6:10].copy(),
-            rates=S[:, 10:13].copy(), rotor_speed=S[:, 13:].copy(),
-        )  # fmt: skip
+        parts = seen[:, :3], seen[:, 3:], S[:, 6:10], S[:, 10:13], S[:, 13:]
+        names = "position", "velocity", "attitude", "rates", "rotor_speed"
+        return {name: x.copy() for name, x in zip(names, parts, strict=True)}
 
     def _measure_if_due(self) -> None:
         """Measure what the law will know if a tick is due."""
         self._supply_tick_tables()
-        now = fleet.sampled_segment(len(self.sampled.S), len(self.plan.edges), self.t, max_steps=0)
-        fly_ticks(self.plan.problem, self.workspace, self.flight, self.sampled, now)
+        at, n = self.integration, len(self.sampled.S)
+        now = fleet.sampled_segment(n, len(at.plan.edges), at.t, max_steps=0)
+        fly_ticks(at.plan.problem, at.workspace, self.flight, self.sampled, now)
 
     def views_of_laws(self) -> list[View | None]:
         """What each vehicle with a law of its own will know if a tick of the laws is due; None for those lost."""
         self._measure_if_due()
-        laws = self.vehicles.laws
+        at, laws = self.integration, self.vehicles.laws
         assert laws is not None
         return laws.views(
-            self.plan.phase.name, self.plan.problem, self.workspace, self.flight, self.sampled
+            at.plan.phase.name, at.plan.problem, at.workspace, self.flight, self.sampled
         )
 
-    def drop_command(self) -> None:
-        """Drop the last command of vehicles."""
-        self.flight = self.flight._replace(commands=fleet.no_commands(len(self.lost)))
-
-    def problem_under(self, command: Command) -> Problem:
-        """The plan's problem, beside the thrust and attitude, or the speeds of rotors, that a controller commands."""
-        t = self.t
-        arrays = check_command(command, len(self.lost), t)
+    def hold_command(self, command: Command | None) -> None:
+        """Hold the thrust and attitude, or the speeds of rotors, that a controller commands; None: no longer."""
+        commands, n, t = self.flight.commands, len(self.sampled.S), self.integration.t
+        if command is None:
+            self.flight = self.flight._replace(commands=fleet.no_commands(n))
+            return
+        arrays = check_command(command, n, t)
         why = ""
         if self.flight.vehicles.point.any():
             why = "but some agents are points; return forces [N]"
@@ -285,45 +270,51 @@ class SampledPhase(ActivePhase):
             what = article_and_kind(command)
             raise FlightError(f"the controller returned {what} at t = {t:.3f} s, {why}")
         if isinstance(command, AttitudeCommand):
-            commands = self.flight.commands._replace(kind=fleet.ATTITUDE, **arrays)
+            commands = commands._replace(kind=fleet.ATTITUDE, **arrays)
         else:
-            commands = self.flight.commands._replace(kind=fleet.ROTORS, speeds=arrays["speed"])
+            commands = commands._replace(kind=fleet.ROTORS, speeds=arrays["speed"])
         self.flight = self.flight._replace(commands=commands)
-        return self.plan.problem._replace()  # not the plan's own: a loss has to keep it held
 
     def search_extremes(self, *, last: bool) -> None:
         """Search the steps flown for extremes."""
-        self.extremes.avoidance = self.vehicles.avoidance
+        at, extremes = self.integration, self.integration.extremes
+        extremes.avoidance = self.vehicles.avoidance
         if self.leader is not None:
-            self.extremes.of_layers = self.leader.layer_extremes(self.t)
+            extremes.of_layers = self.leader.layer_extremes(at.t)
         if self.slowed is not None:
-            time, who = self.slowed
-            self.extremes.of_layers = {"clock": Extremum(self.event_delay, time, who, -1)}
+            extremes.of_layers = {"clock": Extremum(self.late[1], *self.slowed, -1)}
         if rows := int(self.sampled.count[fleet.TRAILED]):
             assert self.flown is not None
             # A motion that grows beyond all bounds has extremes up to there.
-            points = self.state.trail.points[:rows]
+            points = at.state.trail.points[:rows]
             if not -_FAR < points.min() <= points.max() < _FAR:  # NaN is not, either
                 rows = int((abs(points) < _FAR).all(axis=(1, 2)).argmin())
-            self.state.count[records.TRAILED] = rows
-            self.extremes.monitor_paths(self.flown, self.workspace, self.state)
-            self.sampled.count[fleet.TRAILED] = self.state.count[records.TRAILED] = 0
+            at.state.count[records.TRAILED] = rows
+            extremes.monitor_paths(self.flown, at.workspace, at.state)
+            self.sampled.count[fleet.TRAILED] = at.state.count[records.TRAILED] = 0
             self.unjudged = True
         if last and self.unjudged:  # the rest is kept by the flight itself
             assert self.first_tick is not None  # it has begun
             ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
-            self.extremes.take_vehicle_extremes(
-                self.sampled, self.flight.vehicles, self.gone, self.lost, ticks
+            lost = at.plan.before.lost
+            extremes.take_vehicle_extremes(
+                self.sampled, self.flight.vehicles, self.gone, lost, ticks
             )
             self.unjudged = False
 
     def fly(self, problem: Problem, t_end: float) -> None:
-        """Fly to ``t_end`` [s] and record the samples on the way."""
-        plan, sampled = self.plan, self.sampled
+        """Fly to ``t_end`` [s], the end of the plan or of what is decided, and record the samples on the way."""
+        at, plan, sampled = self.integration, self.integration.plan, self.sampled
+        if self.flight.clocks.own:
+            t_end = min(t_end, (math.floor(at.t / _STRETCH + 1e-6) + 1.0) * _STRETCH)
+        elif problem is plan.problem:
+            t_end = min(t_end, self._lead_reference())
+            problem = plan.problem
+        t_end = min(t_end, plan.t_end)  # the leader may have put it off
         n, m = len(plan.masses), len(plan.edges)
         self.flown = problem
-        times = self.sample_times(t_end)
-        self.begun, arrays = True, self.vehicles.avoidance
+        times = at.sample_times(t_end)
+        at.begun, arrays = True, self.vehicles.avoidance
         network, laws = self.vehicles.flight.network, self.vehicles.laws
         if network is not self.flight.network:
             self.flight = self.flight._replace(network=network)
@@ -336,18 +327,18 @@ class SampledPhase(ActivePhase):
                 if status == records.PAUSED:
                     self._supply_tick_tables()
                 elif laws is not None:
-                    laws.call_laws(plan.phase.name, problem, self.workspace, self.flight, sampled)
-                status = fly_ticks(problem, self.workspace, self.flight, sampled, call, arrays)
+                    laws.call_laws(plan.phase.name, problem, at.workspace, self.flight, sampled)
+                status = fly_ticks(problem, at.workspace, self.flight, sampled, call, arrays)
                 self._update_integrator_state()
                 if status == records.ASKS:
                     continue
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
-                    self.state.clock[records.TIME] = t_end
-                if self.external is not None:
-                    self.external.raise_user_error()
-                self.raise_errors()
+                    at.state.clock[records.TIME] = t_end
+                if at.external is not None:
+                    at.external.raise_user_error()
+                at.raise_errors()
                 self.search_extremes(last=False)
-                self.pause(self.t)
+                at.pause()
         finally:
             done = int(sampled.count[fleet.SAMPLES])
             finite = np.isfinite(call.S[:done]).all(axis=(1, 2)) & np.isfinite(call.dS[:done]).all(
@@ -361,31 +352,31 @@ class SampledPhase(ActivePhase):
         if not np.isfinite(sampled.S).all():
             who = agent_names(np.flatnonzero(~np.isfinite(sampled.S).all(axis=1)))
             raise StoppedError(
-                f"the motion of {who} grows beyond all bounds by t = {self.t:.2f} s: the control is unstable. Lower"
+                f"the motion of {who} grows beyond all bounds by t = {at.t:.2f} s: the control is unstable. Lower"
                 " the gains, or raise the rates in [autopilot]"
             )
         if arrays is not None and arrays.count[avoidance.FULL]:
             raise StoppedError(
-                f"avoidance cannot go on at t = {self.t:.2f} s: too many vehicles are near each other for their"
+                f"avoidance cannot go on at t = {at.t:.2f} s: too many vehicles are near each other for their"
                 " speeds. Fly slower, or farther apart"
             )
         if status != records.FINISHED:
-            own = self.external is not None
-            raise StoppedError(diagnose(self, own_force=own, collapsed=True))
+            raise StoppedError(diagnose(at, collapsed=True))
 
     def _supply_tick_tables(self) -> None:
         """Make tables for the next ticks, if those that there are end here or belong to another reference."""
         tables, tick = self.flight.tables, int(self.sampled.count[fleet.TICKS])
-        planned, source = self.plan.problem, self.vehicles.tables
+        plan, source = self.integration.plan, self.vehicles.tables
+        planned = plan.problem
         if planned is self.tabled and tables.first <= tick < tables.last:
             return
         before, tau = None, self.sampled.tau if self.flight.clocks.own else None
         if planned is not self.tabled and source.compensated:
             before = source.switch_path(planned, tick, tables, tau)
         # A piece of a reference that is led holds until the next stop
-        until = self.plan.t_end
+        until = plan.t_end
         if self.by_pieces:
-            until = min(until, self.decided_until if not self.steered else self.stop)
+            until = min(until, self.decided_until if not self.steered else self.integration.stop)
         last = min(tick + _TICKS, math.ceil(until * source.rate) + 1)
         made = source.tables_for(tick, max(last, tick + 1), planned, self.turn, tau)
         if before is not None:  # states that were measured about another path
@@ -396,7 +387,7 @@ class SampledPhase(ActivePhase):
 
     def _update_integrator_state(self) -> None:
         """Take over the true state, and what it cost."""
-        plan, state, sampled = self.plan, self.state, self.sampled
+        plan, state, sampled = self.integration.plan, self.integration.state, self.sampled
         n, m, y = len(plan.masses), len(plan.edges), state.y
         y[: 3 * n], y[3 * n : 6 * n] = sampled.S[:, :3].ravel(), sampled.S[:, 3:6].ravel()
         y[6 * n : 6 * n + m] = sampled.integral
@@ -408,9 +399,9 @@ class SampledPhase(ActivePhase):
         state.count[records.ACCEPTED] += steps
         self.steps_taken_over += steps
 
-    def end(self) -> PhaseState:
-        """End the phase; the vehicles keep their states, and so the workspace, to which these may refer."""
-        plan, t = self.plan, self.t
+    def end(self) -> None:
+        """Leave the vehicles' states to the next phase, and so the workspace, to which these may refer."""
+        plan, t = self.integration.plan, self.integration.t
         self.vehicles.yaw = self.vehicles.tables.yaw_at(plan.problem, t - self.lateness, self.turn)
         if self.flight.clocks.own:
             # The next phase is planned from now on: its times are later by as much, for all clocks alike.
@@ -425,13 +416,12 @@ class SampledPhase(ActivePhase):
         self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
         if self.leader is not None:
             self.vehicles.scale = self.leader.deviation.scale
-        return super().end()
 
     # -- recording --------------------------------------------------------------------------------
 
     def _store_flown_samples(self, problem: Problem, call: fleet.SampledSegment, done: int) -> None:
         """Store samples: states and forces as flown, references and constraints of the plan."""
-        plan = self.plan
+        at, plan = self.integration, self.integration.plan
         S, times = call.S[:done], call.times[:done]
         parts = [S[..., :3].reshape(done, -1), S[..., 3:6].reshape(done, -1), call.integral[:done]]
         frame = np.full((done, 4), np.nan)
@@ -444,16 +434,15 @@ class SampledPhase(ActivePhase):
             plan_time = (times - self.vehicles.waited)[:, None, None] + tau[..., :1]
             tau = np.concatenate([tau, plan_time], axis=2)
         else:
-            planned = native.record(plan.problem, self.workspace, times, y)
+            planned = native.record(plan.problem, at.workspace, times, y)
             tau = tau[..., :0]
         out, kept = _flown_record(planned, call, done, self.flight, problem, tau)
-        self.store_piece(
-            times, out, call.integral[:done], frame, kept, self._avoidance_samples(call, done)
-        )
+        acting = self._avoidance_samples(call, done)
+        at.store_piece(times, out, call.integral[:done], frame, self.turn, kept, acting)
 
     def _record_by_own_clocks(self, times: Floats, y: Floats, tau: Floats) -> Record:
         """A record at the mean of own clocks ``tau`` (K, N, 3), with forces of now, and the slot by each clock."""
-        problem, work = self.plan.problem, self.workspace
+        problem, work = self.integration.plan.problem, self.integration.workspace
         off, rate = tau[:, ~self.flight.vehicles.lost, :2].mean(axis=1).T
         f_E = native.record(problem, work, times, y).f_E
         planned = native.record(problem, work, times + off, y)._replace(f_E=f_E)

@@ -1,4 +1,4 @@
-"""A phase of points, flown by an integrator with steps of variable length."""
+"""Points: their motion is integrated with steps of variable length."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import records
-from rigidfleet.kernel.engine import native, packing
+from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import Problem
 from rigidfleet.planning.tolerances import step_limit
-from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import Command, article_and_kind
 from rigidfleet.simulation.diagnosis import diagnose
+from rigidfleet.simulation.plan_integration import PlanIntegration
 from rigidfleet.simulation.recording import Unevaluated
 from rigidfleet.simulation.solver_setup import first_step, problem_with_solver
 from rigidfleet.typing import Floats
@@ -38,64 +38,69 @@ class Stretch(NamedTuple):
     first: float  # the first time after the start [s]
 
 
-class PointPhase(ActivePhase):
-    """A phase under way that points fly."""
+class PointPropagator:
+    """Points in flight: a `Propagator` by the integrator of the kernel, which chooses its steps."""
 
-    #: Whether another thread searches the steps for extremes. It must not ask the user's force.
-    aside = False
-    #: Steps per call of the integrator; more once their duration is known.
-    steps = 0
+    lateness = 0.0
+
+    def __init__(self, integration: PlanIntegration) -> None:
+        self.integration = integration
+        self.control_start = integration.plan.start
+        self.flown: Problem | None = None  # the problem of the steps in the trail
+        #: The plan's problem, if it is the one flown last: its derivative at the state is known.
+        self.known: Problem | None = None
+        #: Whether another thread searches the steps for extremes. It must not ask the user's force.
+        self.aside = False
+        #: Steps per call of the integrator; more once their duration is known.
+        self.steps = 0
 
     def begin(self, y: Floats, t: float) -> None:
         """Begin to integrate at a state (n,) and time [s]."""
-        super().begin(y, t)
-        plan = self.plan
-        self.aside = plan.is_large and self.external is None
-        self.state = self.extremes.begin_monitoring(
-            y, t, len(plan.edges), rtol=plan.integrator.rtol, atol=plan.tolerances
-        )
+        at = self.integration
+        at.begin(y, t)
+        self.known = None
+        self.aside = at.plan.is_large and at.external is None
         if self.steps:  # after a loss
             return
         self.steps = _FIRST_STEPS
-        if self.external is None:
+        if at.external is None:
             self.steps = max(_FIRST_STEPS, _FIRST_NUMBERS // len(y))
-        if self.solver is not None:
-            self.state.clock[records.NEXT_STEP] = first_step(plan, self.workspace, self.state)
+        if at.solver is not None:
+            at.state.clock[records.NEXT_STEP] = first_step(at.plan, at.workspace, at.state)
 
     def fly(self, problem: Problem, t_end: float) -> None:
-        """Integrate to ``t_end`` [s] and record the samples on the way."""
-        stretch = self.prepare_stretch(problem, self.sample_times(t_end))
-        state, fresh = self.state, stretch.fresh
+        """Integrate to ``t_end`` [s] or the end of the plan, and record the samples on the way."""
+        at, t_end = self.integration, min(t_end, self.integration.plan.t_end)
+        stretch = self.prepare_stretch(problem, at.sample_times(t_end))
+        state, fresh = at.state, stretch.fresh
         status = records.PAUSED
         go_on = native.Integration(
-            problem, self.workspace, state, t_end, stretch.times, stretch.samples
+            problem, at.workspace, state, t_end, stretch.times, stretch.samples
         )
         try:
             while status == records.PAUSED:
                 begun = clock.perf_counter()
-                most = self.extremes.steps_until_trail_full(state) if self.aside else self.steps
+                most = at.extremes.steps_until_trail_full(state) if self.aside else self.steps
                 status = go_on(fresh, min(self.steps, most))
                 took = max(clock.perf_counter() - begun, 1e-6)
                 if status == records.PAUSED:
                     self.steps = min(_STEPS, max(1, int(self.steps * min(_PAUSE / took, 10.0))))
                 fresh = False
-                if self.external is not None:
-                    self.external.raise_user_error()
-                self.raise_errors()
+                if at.external is not None:
+                    at.external.raise_user_error()
+                at.raise_errors()
                 full = state.count[records.TRAILED] == len(state.trail.clock)
                 if self.aside:
-                    full = self.extremes.steps_until_trail_full(state) < 1
+                    full = at.extremes.steps_until_trail_full(state) < 1
                 if status == records.PAUSED or full:
                     self.search_extremes(last=False)
-                self.pause(self.t)
+                at.pause()
                 if status == records.PAUSED and self.has_stalled():
                     break
         finally:
             self.record_samples(stretch)
         if status != records.FINISHED:
-            collapsed = status == records.COLLAPSED
-            own_force = self.external is not None
-            raise StoppedError(diagnose(self, own_force=own_force, collapsed=collapsed))
+            raise StoppedError(diagnose(at, collapsed=status == records.COLLAPSED))
 
     def search_extremes(self, *, last: bool) -> None:
         """Search the steps flown for extremes.
@@ -103,32 +108,33 @@ class PointPhase(ActivePhase):
         In a large formation, the search takes as long as the flight: another thread does it meanwhile. The user's
         force, which may not be ready for two threads, is asked by one.
         """
-        self.extremes.wait_for_steps()
-        if not self.state.count[records.TRAILED] or self.flown is None:
+        at = self.integration
+        at.extremes.wait_for_steps()
+        if not at.state.count[records.TRAILED] or self.flown is None:
             return
-        work = self.workspace if self.solver is None else self.solver.thread_solver.workspace
+        work = at.workspace if at.solver is None else at.solver.thread_solver.workspace
         if last or not self.aside:
-            self.extremes.monitor_steps(self.flown, work, self.state, last=last)
+            at.extremes.monitor_steps(self.flown, work, at.state, last=last)
         else:
-            self.extremes.send_steps(self.flown, work, self.state)
+            at.extremes.send_steps(self.flown, work, at.state)
 
     def prepare_stretch(self, problem: Problem, times: Floats) -> Stretch:
         """Prepare to integrate a problem from now on, and to record the states at some times (K,) [s]."""
-        evaluations = self.state.count[records.EVALUATIONS]
-        fresh = evaluations == 0 or problem is not self.plan.problem
+        at, fresh = self.integration, problem is not self.known
         if fresh:
             self.search_extremes(last=True)
             self.flown = problem
-            if self.solver is not None:  # a solver keeps state: the monitor has its own
-                self.flown = problem_with_solver(self.solver.thread_solver, problem)
-        self.begun = True
-        samples = np.empty((len(times), len(self.state.y)))
-        self.state.count[records.SAMPLES] = 0
-        return Stretch(problem, times, samples, fresh, math.nextafter(self.t, math.inf))
+            if at.solver is not None:  # a solver keeps state: the monitor has its own
+                self.flown = problem_with_solver(at.solver.thread_solver, problem)
+        self.known = problem if problem is at.plan.problem else None
+        at.begun = True
+        samples = np.empty((len(times), len(at.state.y)))
+        at.state.count[records.SAMPLES] = 0
+        return Stretch(problem, times, samples, fresh, math.nextafter(at.t, math.inf))
 
     def record_samples(self, stretch: Stretch) -> None:
         """Store the samples of what was integrated since `prepare_stretch`."""
-        state, (problem, times, samples, _, first) = self.state, stretch
+        state, (problem, times, samples, _, first) = self.integration.state, stretch
         done = int(state.count[records.SAMPLES])
         tried = state.count[records.EVALUATIONS] > 0 and state.count[records.ACCEPTED] == 0
         if tried and len(times) and times[0] <= first:
@@ -138,32 +144,41 @@ class PointPhase(ActivePhase):
 
     def has_stalled(self) -> bool:
         """Whether the phase takes far more steps than its duration explains."""
-        state, since = self.state, self.t - self.plan.start
+        state, since = self.integration.state, self.integration.t - self.integration.plan.start
         steps = int(state.count[records.ACCEPTED] + state.count[records.REJECTED])
         return steps > step_limit(since)
 
-    def problem_under(self, command: Command) -> Problem:
-        """Point masses take no command of vehicles."""
-        raise FlightError(
-            f"the controller returned {article_and_kind(command)} at t = {self.t:.3f} s, which point masses do"
-            " not take; return forces [N], or give the agents a vehicle"
-        )
+    def take_up(self, problem: Problem) -> None:
+        """Make another problem of the same size the plan's."""
+        self.integration.plan.problem = problem
 
-    def free_memory(self) -> None:
-        """Let go of what a large formation has packed."""
-        if self.solver is not None:
-            packing.forget_last_packed()
+    def hold_command(self, command: Command | None) -> None:
+        """Refuse a command of vehicles: point masses take none."""
+        if command is not None:
+            raise FlightError(
+                f"the controller returned {article_and_kind(command)} at t = {self.integration.t:.3f} s, which point"
+                " masses do not take; return forces [N], or give the agents a vehicle"
+            )
+
+    def states_seen(self) -> dict[str, Floats]:
+        """Positions and velocities (N, 3) as measured, after an evaluation of the law [m, m/s]."""
+        w, noise = self.integration.workspace, self.integration.plan.problem.disturbance.noise_r
+        r, v = (w.r_seen, w.v_seen) if len(noise) else (w.r, w.v)
+        return {"position": r.copy(), "velocity": v.copy()}
+
+    def end(self) -> None:
+        """Leave nothing: all of points is in the state."""
 
     def _store_samples(self, problem: Problem, times: Floats, samples: Floats) -> None:
         """Store the samples; forces and references at them are evaluated when they are asked for."""
-        plan = self.plan
+        at, plan = self.integration, self.integration.plan
         n, m = len(plan.masses), len(plan.edges)
-        setup = None if self.solver is None else self.solver.setup
+        setup = None if at.solver is None else at.solver.setup
         source = Unevaluated(native.pack(problem), plan.problem, samples, setup)
-        if self.external is not None:  # a user's function is asked while it is at hand
-            source = source.evaluate(times, self.workspace)
+        if at.external is not None:  # a user's function is asked while it is at hand
+            source = source.evaluate(times, at.workspace)
         frame = np.broadcast_to(np.nan, (len(times), 4))
         if plan.frame is not None:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
-        self.store_piece(times, source, samples[:, 6 * n : 6 * n + m], frame)
+        at.store_piece(times, source, samples[:, 6 * n : 6 * n + m], frame)
