@@ -65,10 +65,10 @@ class Propagator(Protocol):
         """Search the steps flown for extremes; ``last``: no further steps of this problem follow."""
 
     def take_up(self, problem: Problem) -> None:
-        """Make another problem of the same size, such as one with a different reference, the plan's: by hand."""
+        """Fly on by hand: by another problem of the same size, which becomes the plan's."""
 
     def hold_command(self, command: Command | None) -> None:
-        """Hold a command of vehicles from now on, instead of the last one; None: none.
+        """Hold a command of vehicles from now on, or none, instead of the last one.
 
         Raises
         ------
@@ -80,7 +80,7 @@ class Propagator(Protocol):
         """Copies of the states that an `Observation` shows, by its names, after an evaluation of the law."""
 
     def end(self) -> None:
-        """Leave to the next phase what is not in the state: nothing is flown from then on."""
+        """Leave to the next phase what is not in the state; nothing is flown from then on."""
 
 
 class ActivePhase:
@@ -201,8 +201,8 @@ class ActivePhase:
             self.fly_to(min(t, t_end), controller, rate)
             if self.t < min(t, self.plan.t_end):
                 return  # between two checks
-            shaped = self.t - self.propagator.lateness >= least
-            quiet = shaped and self._settling_error() <= settle.tolerance
+            due = self.t - self.propagator.lateness >= least
+            quiet = due and self._settling_error() <= settle.tolerance
             self.quiet_since = min(self.quiet_since, self.t) if quiet else math.inf
 
     def search_extremes(self) -> None:

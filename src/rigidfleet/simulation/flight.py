@@ -720,7 +720,7 @@ class Flight:
             self._solves.setdefault(method, type(counts)()).add(counts)
         self._ended = active
         self._t = record.t_end = active.t
-        at.raise_errors()  # told at once
+        at.raise_errors()  # those of a solver, at once
         if abandoned:
             points = () if record.target is None else record.target.get("through", ())
             came = [point for point in points if point["time"] <= record.t_end]

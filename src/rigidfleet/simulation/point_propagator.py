@@ -144,9 +144,9 @@ class PointPropagator:
 
     def has_stalled(self) -> bool:
         """Whether the phase takes far more steps than its duration explains."""
-        state, since = self.integration.state, self.integration.t - self.integration.plan.start
-        steps = int(state.count[records.ACCEPTED] + state.count[records.REJECTED])
-        return steps > step_limit(since)
+        at, count = self.integration, self.integration.state.count
+        steps = int(count[records.ACCEPTED] + count[records.REJECTED])
+        return steps > step_limit(at.t - at.plan.start)
 
     def take_up(self, problem: Problem) -> None:
         """Make another problem of the same size the plan's."""

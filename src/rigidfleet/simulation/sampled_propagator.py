@@ -256,9 +256,10 @@ class SampledPropagator:
 
     def hold_command(self, command: Command | None) -> None:
         """Hold the thrust and attitude, or the speeds of rotors, that a controller commands; None: no longer."""
-        commands, n, t = self.flight.commands, len(self.sampled.S), self.integration.t
+        n, t = len(self.sampled.S), self.integration.t
+        commands = fleet.no_commands(n)
+        self.flight = self.flight._replace(commands=commands)
         if command is None:
-            self.flight = self.flight._replace(commands=fleet.no_commands(n))
             return
         arrays = check_command(command, n, t)
         why = ""
