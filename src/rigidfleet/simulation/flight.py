@@ -712,7 +712,8 @@ class Flight:
         record.controller = (
             None if self._built_in else self.controller is None or active.control_calls > 0
         )
-        record.target = active.plan.target_record  # clocks that wait put it off
+        if self._vehicles is not None:  # which may have waited, so that it came later
+            record.target = active.plan.target_record
         record.settled = None if abandoned else active.has_settled
         at.count_work()
         self._count += at.counted
