@@ -139,8 +139,10 @@ def slots_from_distances(n: int, edges: ArrayLike, lengths: ArrayLike) -> Floats
     # Near a flat shape, an error e in a distance moves points by sqrt(e); therefore distances decide, not the volume.
     largest = d.max(initial=0.0)
     if error > np.sqrt(REALISABLE) * largest or value[0] < -REALISABLE * n * largest**2:
+        # Eigenvalues alone: their vectors, and so the points, are not unique where eigenvalues are equal.
+        off = np.sqrt((np.abs(value).sum() - top.sum()) / n)
         raise ValueError(
-            f"no points in space have these distances (the nearest realisable set is {error:.3g} m off)"
+            f"no points in space have these distances (they miss space by {off:.3g} m in the root mean square)"
         )
     return _turn_to_slot_convention(p)
 
