@@ -143,7 +143,8 @@ def sweep(
                 )  # fmt: skip
         except KeyboardInterrupt:
             done = len(store.read(folder).run) if store.is_store(folder) else 0
-            words = f"Interrupted: {done} of {definition.runs} runs are saved in {folder}"
+            runs = shards.runs_of_shard(shard, definition.runs).sum()
+            words = f"Interrupted: {done} of {runs} runs are saved in {folder}"
             again = f"To resume: rigidfleet sweep {whole}{shard and f' --shard {shard}'}"
             console.err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
             return INTERRUPTED
