@@ -221,12 +221,8 @@ class _Study:
         self.flown: dict[tuple[float, ...], Flown] = {}
         self.slacks: dict[tuple[float, ...], float] = {}
         self.rounds = 0
-        self.begun, self.total, self.count, self.progress = (
-            perf_counter(),
-            budget,
-            workers,
-            progress,
-        )
+        self.begun, self.total = perf_counter(), budget
+        self.count, self.progress = workers, progress
         #: Numbers of runs that are done, flown and failed: of the sweeps before, and of the present one.
         self.before = self.now = np.zeros(3, dtype=np.int64)
         self.stack = ExitStack()
