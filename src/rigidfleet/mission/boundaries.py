@@ -82,8 +82,7 @@ class Boundaries:
     def __init__(self, mission: Mission) -> None:
         self.mission = mission
         self.radius, self.k = mission.fleet.radius, mission.drag / mission.true_mass
-        d = mission.disturbances
-        self.wind = np.array((0.0, 0.0, 0.0) if d is None else d.wind)
+        self.wind = np.array(mission.all_disturbances.wind)
         self.g = mission.gravity
         kind_of = [fence.kind for fence in mission.fences]
         self.every = [
