@@ -219,10 +219,10 @@ def _metrics() -> str:
 def _drill() -> str:
     """The keys of a drill: name, magnitudes unless a sweep file has others, meaning."""
     rows = [
-        (f"`{name}`", ", ".join(f"{x:g}" for x in magnitudes), str(field.description))
+        (f"`{name}`", ", ".join(map(str, magnitudes)), str(field.description))
         for name, field in Drill.model_fields.items()
         for default in [field.default]
-        for magnitudes in [default if isinstance(default, tuple) else (default,)]
+        for magnitudes in [default if isinstance(default, tuple) else [default][default is None :]]
     ]
     return _markdown(("key", "default", "meaning"), rows)
 

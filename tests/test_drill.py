@@ -540,6 +540,42 @@ def test_what_assess_reads_is_drilled_or_refused_with_the_reason(
         assert error.partition("any fault: ")[2].partition(". Mend")[0] in said
 
 
+def test_a_drill_reads_files_as_assess_does(tmp_path, capsys, monkeypatch):
+    """Units, axes, gaps and the curve between samples that `assess` is told: the drill is that of the plain table."""
+    monkeypatch.chdir(tmp_path)
+    t = np.concatenate([np.arange(0.0, 1.05, 0.1), np.arange(4.0, 5.05, 0.1)])
+    places = {"a": (t, 0 * t, 2 + t), "b": (2 + t, 0.3 * t, 2 + t), "c": (4 + t, 0 * t, 2 - t)}
+    plain, turned = ["time,agent,x,y,z"], ["time,agent,x,y,z"]
+    for name, (x, y, z) in places.items():
+        for row in np.column_stack([t, x, y, z]).tolist():
+            plain.append(f"{row[0]},{name},{row[1]},{row[2]},{row[3]}")
+            turned.append(f"{1e3 * row[0]},{name},{1e3 * row[2]},{1e3 * row[1]},{-1e3 * row[3]}")
+    Path("plain.csv").write_text("\n".join(plain) + "\n")
+    Path("turned.csv").write_text("\n".join(turned) + "\n")
+    gaps, units = ("--gaps", "bridge", "--interpolation", "linear"), ("--units", "ms,mm")
+
+    def drill(*more):
+        line = ["sweep", *more, "--drill", "--separation", "1.9", "--runs", "24", "--no-figures"]
+        return main([*line, "--json"]), capsys.readouterr()
+
+    code, outcome = drill("plain.csv")
+    assert code == 2
+    assert "gaps" in outcome.err
+    code, outcome = drill("plain.csv", *gaps)
+    assert code == 0, outcome.err
+    expected = json.loads(outcome.out)
+    code, outcome = drill("turned.csv", *gaps, *units, "--axes", "ned")
+    assert code == 0, outcome.err
+    again = json.loads(outcome.out)
+    assert expected["flown"] == again["flown"] == 24
+    for one, other in zip(expected["drill"], again["drill"], strict=True):
+        assert one["failed"] == other["failed"]
+        assert one["worst"] == pytest.approx(other["worst"], abs=1e-6)
+    assert any(case["failed"]["count"] for case in again["drill"])
+    assert drill("sweeps/turned-drill", *units)[0] == 2  # as it was defined
+    assert main(["sweep", "market-square", "--drill", *units]) == 2
+
+
 def test_a_result_is_not_drilled(tmp_path, capsys, monkeypatch):
     """The result of a flight is refused: its mission is what can be drilled; so is a folder with nothing in it."""
     monkeypatch.chdir(tmp_path)
@@ -575,6 +611,7 @@ WRONG = {
     "no trial": ({"trials": 0}, "drill.trials.*must be >= 1"),
     "all lost": ({"lost": [12]}, "drill.lost.*too much for 12 vehicles"),
     "its own file": ({"another": [1, 12]}, "drill.another.*too much for 12 vehicles"),
+    "nothing to read": ({"units": "mm"}, "drill.units.*no effect without files"),
     "too many": ({"late": [1.0], "vehicles": [13]}, "drill.vehicles.*too much for 12 vehicles"),
 }
 

@@ -203,6 +203,30 @@ def test_a_fall_lands_where_a_vehicle_falls_that_the_flight_loses():
     assert place == pytest.approx(result.position[later, 1, :2], abs=1e-4)
 
 
+BELOW_ZERO = {
+    "roof": {"kind": "box", "min": [-9, -8, -7], "max": [9, 8, -3]},
+    "turned roof": {"kind": "box", "min": [-9, -2, -13], "max": [9, 2, 3], "roll_deg": 90.0},
+    "hill": {"kind": "heights", "corner": [-9, -9], "spacing": 18, "heights": [[-4, -4], [-2, -2]]},
+}
+
+
+@pytest.mark.parametrize("thing", BELOW_ZERO)
+@pytest.mark.parametrize("ground", [None, -2.0, -9.0])
+def test_falls_end_on_roofs_and_terrain_below_zero(thing, ground):
+    """On roofs and a hill at -3 m, or on the ground if that is higher; beside them, no higher, as on the ground."""
+    data = beside(people=[{"polygon": square(99, 99), "floor": -9.0, "ceiling": 2.0}])
+    floor = [] if ground is None else [{"kind": "ground", "height": ground}]
+    data["obstacles"] = [BELOW_ZERO[thing], *floor]
+    own = boundaries.Boundaries(rf.Mission.from_dict(data))
+    r = np.array([[[0.0, 0.0, 20.0], [0.0, 30.0, 20.0], [30.0, 0.0, 20.0]]])
+    ends = own.ends_of_falls(r, np.zeros((1, 3, 3)))[0]
+    on, *beside_it = ends[:, 2].tolist()
+    level = -np.inf if ground is None else ground
+    assert on == pytest.approx(max(-3.0, level), abs=0.25)
+    assert all(z <= -3.0 if ground is None else z == ground for z in beside_it)
+    assert ends[:, :2] == pytest.approx(r[0, :, :2], abs=1e-6)
+
+
 @pytest.mark.parametrize("flown", ["points", "body", "vehicles", "curves"])
 def test_flights_are_judged_between_samples(flown):
     """Records with two samples a second have the worst values of the same flight with 500, of every kind of flight."""

@@ -16,7 +16,7 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
-from matplotlib.text import Text
+from matplotlib.text import Annotation, Text
 from PIL import Image
 from sample_flights import drifting, swarm
 from scipy.spatial import ConvexHull
@@ -1176,6 +1176,19 @@ def test_the_summary_is_on_the_page(flight):
         assert box is not None
         assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1, ax.get_ylabel()
         assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1, ax.get_ylabel()
+
+
+@pytest.mark.parametrize("flight", ["market-square", "lossy-passage", "statue"])
+def test_names_of_waypoints_stay_in_the_view_from_above(flight):
+    """With their outlines of 1.25 points, whether their waypoints are near its right side or its upper one."""
+    figure = drawn("summary", simulate(load_mission(flight)))
+    above = figure.axes[1]
+    names = [text for text in above.texts if isinstance(text, Annotation)]
+    assert names
+    for name in names:
+        box = name.get_window_extent().padded(1.25 * figure.dpi / 72)
+        assert (box.min >= above.bbox.min).all(), name.get_text()
+        assert (box.max <= above.bbox.max).all(), name.get_text()
 
 
 def test_a_legend_has_each_look_of_fences_once():

@@ -1393,6 +1393,24 @@ def test_interrupted(folder):
     assert "rigidfleet sweep sweeps/pair" in err
 
 
+def test_a_shard_that_is_interrupted_counts_its_own_runs(folder, capsys, monkeypatch):
+    """Of 20 runs in groups of eight, the first of two shards has the first and the last group: 12 runs."""
+
+    def stop(progress):
+        if progress.done:
+            raise KeyboardInterrupt
+
+    def fly_a_group(*args, progress, **keys):
+        return fly(*args, progress=stop, **keys)
+
+    monkeypatch.setattr("rigidfleet.sweep.fly", fly_a_group)
+    line = ["sweep", "pair.toml", "--vary", SCATTER[0], "--runs", "20", "--workers", "1"]
+    assert cli.main([*line, "--shard", "1/2"]) == codes.INTERRUPTED
+    err = capsys.readouterr().err
+    assert "Interrupted: 8 of 12 runs are saved in sweeps/pair/shards/1-of-2" in err
+    assert "To resume: rigidfleet sweep sweeps/pair --shard 1/2" in err
+
+
 def test_the_example_flies(folder, capsys):
     """The sweep file among the examples flies; only unstable gains are refused."""
     assert (

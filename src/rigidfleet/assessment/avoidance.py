@@ -107,5 +107,5 @@ def _why_guarantee_is_unproved(measured: Measurements) -> str:
 
     if measured.result.statistics.get("pushed"):
         return "a force from outside acted, which it does not know"
-    mission = measured.mission
-    return why_no_guarantee(mission.vehicle_models or [], mission.disturbances, mission.obstacles)
+    mission, d = measured.mission, measured.mission.all_disturbances
+    return why_no_guarantee(mission.vehicle_models or [], d, mission.obstacles)

@@ -25,7 +25,7 @@ from rigidfleet.assessment.verdict import (
     limit_check,
     value,
 )
-from rigidfleet.result import LABELS, PAD, Result
+from rigidfleet.result import LABELS, Result
 from rigidfleet.result.quantities import Samples
 
 # Greatest overlap of a vehicle that stands on an obstacle [m]; more is a collision.
@@ -244,18 +244,18 @@ def _touch_down_checks(measured: Measurements, phases: list[PhaseVerdict]) -> It
             continue
         k = measured.parts[i].stop - 1
         down = -measured.result.velocity[k, :, 2]
-        low = np.flatnonzero(measured.left[k] & (measured.closeness.each[k] <= PAD))
-        low = low[measured.obstacles_stood_on(np.full(len(low), k), low).any(axis=0)]
+        (at, who), below = measured.near_and_below
+        low = who[(at == k) & below.any(axis=0)]
         if not len(low):
             yield _result_at_end(p, "touch_down", False, "no vehicle is on the ground")
             continue
         worst = int(low[down[low].argmax()])
-        who, speed = f"agent {worst + 1}", max(0.0, float(down[worst]))
-        words = f"{who} touches down at {value(speed, 'm/s')} (limit {TOUCH_DOWN:g} m/s)"
+        agent, speed = f"agent {worst + 1}", max(0.0, float(down[worst]))
+        words = f"{agent} touches down at {value(speed, 'm/s')} (limit {TOUCH_DOWN:g} m/s)"
         if (off := int(np.isfinite(measured.result.motors_off).sum())) > 0:
             words += f"; {off} vehicle{'s' if off > 1 else ''} may switch off"
         judged = speed <= TOUCH_DOWN, words, speed, TOUCH_DOWN, "m/s"
-        yield _result_at_end(p, "touch_down", *judged, who=who)
+        yield _result_at_end(p, "touch_down", *judged, who=agent)
 
 
 def _velocity_jump_check(measured: Measurements) -> Iterator[CheckResult]:

@@ -27,7 +27,7 @@ from rigidfleet.formation.assignment import least_squares_assignment
 from rigidfleet.math import proximity
 from rigidfleet.math.smoothing import NoiseEstimate
 from rigidfleet.result import Result
-from rigidfleet.result.quantities import SAMPLED
+from rigidfleet.result.quantities import SAMPLED, norms
 from rigidfleet.typing import Floats, Ints
 
 #: What positions do not show: checks of a log leave it out.
@@ -89,11 +89,11 @@ class DrawnWays:
                 return _estimate_greatest_norm(shifts[:, order, k])
             i, j = proximity.all_pairs(self.result.n_agents)
             by = _estimate_greatest_norm(shifts[:, 0, k, i] - shifts[:, 0, k, j])
-            least = float(_norms(self.result.position[k, i] - self.result.position[k, j]).min())
+            least = float(norms(self.result.position[k, i] - self.result.position[k, j]).min())
             if check.worst is None:  # what is lost where vehicles may change places
                 return by if by > 0.5 * least else 0.0
             return math.degrees(math.atan2(by, least)) if check.unit == "deg" else by
-        sizes = _norms(shifts[:, order])
+        sizes = norms(shifts[:, order])
         most = _estimate_greatest(sizes)
         if q.name in ("separation", "separation_flying"):
             k, i, j = self._near_pairs(float(check.worst or 0.0) + 4.0 * most)
@@ -115,7 +115,7 @@ class DrawnWays:
         """Samples and pairs whose surfaces are nearer than a distance: the nearest ones, if they are many."""
         radius, (i, j) = self.result.mission.fleet.radius, proximity.all_pairs(self.result.n_agents)
         parts = np.array_split(self.result.position, -(-len(self.result.time) * len(i) // _AT_ONCE))
-        apart = np.concatenate([_norms(r[:, i] - r[:, j]).astype(np.float32) for r in parts])
+        apart = np.concatenate([norms(r[:, i] - r[:, j]).astype(np.float32) for r in parts])
         apart = (apart - (radius[i] + radius[j])).ravel()
         near = np.flatnonzero(apart <= max(reach, float(apart.min())))
         if len(near) > _CANDIDATES:
@@ -124,12 +124,8 @@ class DrawnWays:
         return k, i[pair], j[pair]
 
 
-def _norms(x: Floats) -> Floats:
-    return np.sqrt(np.einsum("...a,...a->...", x, x))
-
-
 def _estimate_greatest_norm(draws: Floats) -> float:
-    return _estimate_greatest(_norms(draws))
+    return _estimate_greatest(norms(draws))
 
 
 def _estimate_greatest(sizes: Floats) -> float:

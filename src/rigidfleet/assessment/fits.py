@@ -98,7 +98,8 @@ def shape_of_slots(slots: Floats) -> SlotShape:
     dimension = int(np.count_nonzero(extents > THIN * extents[0]))
     axis = axes[0] if dimension == 1 else axes[2]
     order = (centred @ axis).argsort().tolist() if dimension == 1 else []
-    apart = _pair_distances(slots) if few else np.empty(0)
+    pairs = proximity.all_pairs(len(slots) if few else 0).T
+    apart = proximity.pair_distances(slots[None], pairs)[:, 0]
     shortest = float((apart if few else proximity.nearest(slots)).min())
     return slots, centred, dimension, axis, order, apart, shortest
 
@@ -109,19 +110,14 @@ def formation_shape(mission: Any, name: str, *who: int) -> SlotShape | None:
     return None if slots is None or len(who) < 2 else shape_of_slots(slots[list(who)])
 
 
-def _pair_distances(p: Floats) -> Floats:
-    """Distances (..., P) [m] of all pairs of few agents p (..., N, 3)."""
-    i, j = proximity.all_pairs(p.shape[-2])
-    return norms(p.take(i, axis=-2) - p.take(j, axis=-2))
-
-
 #: Error of a distance [m], of which two, the distances flown and intended [m].
 _Worst = tuple[float, int, int, float, float]
 
 
 def _worst_pair_errors(p: Floats, intended: Floats) -> Iterator[_Worst]:
     """Worst errors of all pairs, ``intended`` (P,) apart, at samples p (G, N, 3); of equal errors the first."""
-    (i, j), flown = proximity.all_pairs(p.shape[1]), _pair_distances(p)
+    i, j = pairs = proximity.all_pairs(p.shape[1])
+    flown = proximity.pair_distances(p, pairs.T).T
     error = np.abs(flown - intended)
     least = error.max(axis=1, keepdims=True) - _ROUNDING * intended.max()
     k, at = (error >= least).argmax(axis=1), np.arange(len(p))

@@ -171,8 +171,7 @@ class Measurements:
             # No vehicle ever stands on an obstacle.
             return {"clearance_flight": self.worst("clearance")}
         off, beside = clearance > PAD, np.zeros(clearance.shape, dtype=np.bool_)
-        near = np.nonzero(clearance <= PAD)
-        below = self.obstacles_stood_on(*near)
+        near, below = self.near_and_below
         off[near], beside[near] = ~below.any(axis=0), ~below[nearest[near], np.arange(len(near[0]))]
         first = np.where(off.any(axis=0), off.argmax(axis=0), len(time))
         last = np.where(off.any(axis=0), len(time) - 1 - off[::-1].argmax(axis=0), len(time))
@@ -194,10 +193,13 @@ class Measurements:
             for name, part in parts.items()
         }
 
-    def obstacles_stood_on(self, k: Ints, i: Ints) -> Bools:
-        """On which obstacles (B, M) agents i (M,) stand, or may stand if they stay, at samples k (M,)."""
-        r, things = self.result.position[k, i], self.mission.obstacles
-        return proximity.below(r, self.mission.fleet.radius[i], things, self.result.time[k], PAD)
+    @cached_property
+    def near_and_below(self) -> tuple[tuple[Ints, ...], Bools]:
+        """Samples (M,) and agents (M,) within `PAD` of an obstacle; on which (B, M) they stand, or may if they stay."""
+        k, i = near = np.nonzero(mask_lost(self.result, self.closeness.each) <= PAD)
+        r, things = self.result.position[near], self.mission.obstacles
+        radius, time = self.mission.fleet.radius[i], self.result.time[k]
+        return near, proximity.below(r, radius, things, time, PAD)
 
     def contradictions_and_times(self) -> Iterator[tuple[str, float]]:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from rigidfleet._common.quantities import LIMITS_OF_CURVES
+from rigidfleet._common.reading import Gaps, Interpolation, Spans
 from rigidfleet.cli import console
 from rigidfleet.cli.arguments import MissionName
 from rigidfleet.cli.codes import FAILED, PASSED, UNDECIDED
@@ -37,9 +38,9 @@ def assess(
     limits: Annotated[list[str] | None, Parameter(help=_LIMITS)] = None,
     radius: float | None = None,
     ground: float | None = None,
-    interpolation: Literal["cubic", "linear"] | None = None,
-    spans: Literal["refuse", "stand", "away"] | None = None,
-    gaps: Literal["refuse", "bridge"] | None = None,
+    interpolation: Interpolation | None = None,
+    spans: Spans | None = None,
+    gaps: Gaps | None = None,
     units: str | None = None,
     axes: str | None = None,
     noise: str | None = None,

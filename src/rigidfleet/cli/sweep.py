@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from rigidfleet._common.reading import Gaps, Interpolation
 from rigidfleet.cli import console
 from rigidfleet.cli.arguments import MissionName, Workers, to_whole_number
 from rigidfleet.cli.codes import BAD_INPUT, INTERRUPTED, PASSED
@@ -27,6 +28,11 @@ def sweep(
     drill: bool = False,
     separation: float | None = None,
     radius: float | None = None,
+    interpolation: Interpolation | None = None,
+    gaps: Gaps | None = None,
+    units: str | None = None,
+    axes: str | None = None,
+    topic: list[str] | None = None,
     runs: Annotated[int | None, Parameter(converter=to_whole_number)] = None,
     seed: Annotated[int | None, Parameter(converter=to_whole_number)] = None,
     out: Path | None = None,
@@ -68,6 +74,18 @@ def sweep(
         Least distance [m] between two vehicles of others' trajectories, less their radii.
     radius : float
         Radius [m] of their vehicles. Default: 0, distances are centre to centre.
+    interpolation : str
+        Between their samples: cubic or linear. Default: cubic.
+    gaps : str
+        Times without samples, longer than ten usual steps of a vehicle: refuse, or bridge (by the curve). Default:
+        refuse.
+    units : str
+        Units of a table's columns that do not name theirs: of time, length and angle, such as ms,mm,deg. Default:
+        s,m,rad.
+    axes : str
+        Where x, y and z of a table point: enu, ned, or three others of e, n, u, w, s and d. Default: enu.
+    topic : list
+        Topic or message of a log that has positions; may be repeated. Default: chosen.
     runs : int
         Number of runs; more can be added later. Default: one per point of the grid.
     seed : int
@@ -129,8 +147,12 @@ def sweep(
             "seed": seed, "evaluate": "final" if final_states else None, "random_numbers": random_numbers,
             "controller": controller, "rate": rate, "agent": agent, "drill": {} if drill else None,
         }  # fmt: skip
-        limits = {"separation": separation, "radius": radius}
-        definition, whole = _sweep_and_folder(mission, vary or [], runs, out, shard, keys, limits)
+        others: dict[str, Any] = {
+            "separation": separation, "radius": radius, "interpolation": interpolation, "gaps": gaps, "units": units,
+            "axes": axes, "topic": topic,
+        }  # fmt: skip
+        others = {key: value for key, value in others.items() if value is not None}
+        definition, whole = _sweep_and_folder(mission, vary or [], runs, out, shard, keys, others)
         folder = shards.shard_folder(whole, shard)
         if (map_ or metric) and definition.drill:
             raise RigidfleetError("--map and --metric: a drill has no map. Remove them.")
@@ -143,7 +165,8 @@ def sweep(
                 )  # fmt: skip
         except KeyboardInterrupt:
             done = len(store.read(folder).run) if store.is_store(folder) else 0
-            words = f"Interrupted: {done} of {definition.runs} runs are saved in {folder}"
+            runs = shards.runs_of_shard(shard, definition.runs).sum()
+            words = f"Interrupted: {done} of {runs} runs are saved in {folder}"
             again = f"To resume: rigidfleet sweep {whole}{shard and f' --shard {shard}'}"
             console.err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
             return INTERRUPTED
@@ -175,16 +198,17 @@ def sweep(
 
 def _sweep_and_folder(
     what: str, vary: list[str], runs: int | None, out: Path | None, shard: str, keys: dict[str, Any],
-    limits: dict[str, float | None],
+    of_others: dict[str, Any],
 ) -> tuple[Sweep, Path]:  # fmt: skip
-    """Sweep of the command line, and its folder; ``limits`` are those of others' trajectories."""
+    """Sweep of the command line, and its folder; ``of_others``: limits and reading of others' trajectories."""
     from rigidfleet.mission import mission_names
     from rigidfleet.sweep import Sweep, shards, store
     from rigidfleet.sweep.definition import is_sweep_file
+    from rigidfleet.sweep.faults import READING
 
     here = Path(what)
     if stored := [here] * store.is_store(here) or (shards.shard_folders(here) if shard else []):
-        if vary or out is not None or any(value is not None for value in keys.values()):
+        if vary or out is not None or of_others or any(x is not None for x in keys.values()):
             raise RigidfleetError(
                 f"{what}: is the folder of a sweep, whose definition cannot change. Remove all options that define one:"
                 " only --runs may grow."
@@ -194,13 +218,14 @@ def _sweep_and_folder(
         return definition, here
     named = what in mission_names()
     others = keys["drill"] is not None and not named and here.suffix != ".toml" and here.exists()
-    if chosen := [key for key, value in limits.items() if value is not None and not others]:
+    if of_others and not others:
         raise RigidfleetError(
-            f"--{chosen[0]}: is of others' trajectories, by --drill; a mission has its own. Remove it."
+            f"--{next(iter(of_others))}: is of others' trajectories, by --drill; a mission has its own. Remove it."
         )
     if others:
-        mission = _mission_of_trajectories(here, **limits)
-        keys["drill"] = {"files": [str(here.resolve())]}
+        mission = _mission_of_trajectories(here, **of_others)
+        read = {key: x for key, x in of_others.items() if key in READING}
+        keys["drill"] = {"files": [str(here.resolve())], **read}
         definition = Sweep.of(mission, vary, runs=runs, origin="rigidfleet sweep", **keys)
     elif not named and is_sweep_file(what):
         definition = Sweep.load(what, more=vary, runs=runs, **keys)
@@ -209,8 +234,10 @@ def _sweep_and_folder(
     return definition, out or Path("sweeps", definition.name)
 
 
-def _mission_of_trajectories(path: Path, separation: float | None, radius: float | None) -> Mission:
-    """What others' trajectories are judged by.
+def _mission_of_trajectories(
+    path: Path, separation: float | None = None, radius: float = 0.0, **how: Any
+) -> Mission:
+    """What others' trajectories are judged by, which are read as ``how`` says.
 
     Raises
     ------
@@ -227,7 +254,7 @@ def _mission_of_trajectories(path: Path, separation: float | None, radius: float
         raise RigidfleetError(
             f"{path}: is no mission, and has no limits. Give --separation, the least distance [m]."
         )
-    read = read_trajectories(path, spans="stand")
+    read = read_trajectories(path, spans="stand", **how)
     return result_of_trajectories(
-        read, separation=separation, radius=radius or 0.0, name=flight_name(path)
+        read, separation=separation, radius=radius, name=flight_name(path)
     ).mission

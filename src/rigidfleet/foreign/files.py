@@ -11,11 +11,12 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from rigidfleet._common.files import os_error_in_words
+from rigidfleet._common.reading import Gaps, Interpolation, Spans
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet._common.text import first_few
 from rigidfleet.errors import TrajectoryError
@@ -26,11 +27,6 @@ from rigidfleet.math.piecewise import Piecewise, concatenate_curves
 
 __all__ = ["Gaps", "Interpolation", "Spans", "Trajectories", "read_trajectories"]
 
-Interpolation = Literal["linear", "cubic"]
-#: What a vehicle does before its first sample and after its last one, while others have samples.
-Spans = Literal["refuse", "stand", "away"]
-#: What a long gap between two samples of a vehicle is: an error, or time in which the curve is believed.
-Gaps = Literal["refuse", "bridge"]
 #: Greatest size of a file [bytes], number of files, and coordinate [m] or time [s] of a trajectory.
 _BYTES, _FILES, FARTHEST = 256 << 20, 20_000, 1e6
 #: Greatest number of notes on what was read.

@@ -168,11 +168,9 @@ def local_law(t, p, w):
             a = w.a_ref[i, q] + (g if q == 2 else 0.0)
             w.f_u[i, q] = m[i] * (a - control.k1 * e - control.k2 * e_dot)
             w.wrench[q] += m[i] * a
-        x, y, z = (
-            w.r_ref[i, 0] - w.body[0, 0],
-            w.r_ref[i, 1] - w.body[0, 1],
-            w.r_ref[i, 2] - w.body[0, 2],
-        )
+        x = w.r_ref[i, 0] - w.body[0, 0]
+        y = w.r_ref[i, 1] - w.body[0, 1]
+        z = w.r_ref[i, 2] - w.body[0, 2]
         a0, a1, a2 = m[i] * w.a_ref[i, 0], m[i] * w.a_ref[i, 1], m[i] * (w.a_ref[i, 2] + g)
         w.wrench[3] += y * a2 - z * a1
         w.wrench[4] += z * a0 - x * a2

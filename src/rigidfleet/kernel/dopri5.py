@@ -50,9 +50,9 @@ _D = np.array(
 
 
 @jit
-def forget_stages(k, first):
-    """Set the stages from ``first`` on to zero: NaN in them would survive a weight of zero."""
-    k[first:_STAGES] = fill_lanes(0.0)
+def forget_stages(k):
+    """Set stages k to zero: NaN in them would survive a weight of zero."""
+    k[:] = fill_lanes(0.0)
 
 
 @jit_inline
@@ -192,7 +192,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     k = as_lanes(K)
     t, h, last = clock[TIME], clock[NEXT_STEP], clock[LAST_ERROR]
     if fresh:
-        forget_stages(k, 0)
+        forget_stages(k[:_STAGES])
     first = 0 if fresh else 1
     status = PAUSED
     for _ in range(max_steps):
@@ -215,7 +215,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
             if error < math.inf:
                 shrink = 0.9 * error**-0.2
             else:
-                forget_stages(k, 1)
+                forget_stages(k[1:_STAGES])
             h *= max(0.1, shrink)
             if h < 1e-12 * max(1.0, abs(t)):
                 status = COLLAPSED

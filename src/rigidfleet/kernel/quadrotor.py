@@ -73,19 +73,15 @@ def write_quadrotor_derivative(y, command, i, vehicles, around, air, push, T, dy
             over = max(around.ground, height_below(y[0], y[1], y[2], around.roofs))
             if over > -math.inf:
                 gain = ground_effect_factor(y[2] - over, vehicles.radius[i], vehicles.span[i])
-        k0, k1, k2 = (
-            gain * vehicles.thrust[i, 0],
-            gain * vehicles.thrust[i, 1],
-            gain * vehicles.thrust[i, 2],
-        )
+        k0 = gain * vehicles.thrust[i, 0]
+        k1 = gain * vehicles.thrust[i, 1]
+        k2 = gain * vehicles.thrust[i, 2]
         c0, c1, c2 = vehicles.torque[i, 0], vehicles.torque[i, 1], vehicles.torque[i, 2]
         k_d, k_z, k_h = vehicles.rotor_drag[i, 0], vehicles.rotor_drag[i, 1], vehicles.lift[i]
         for j in range(4):
-            x0, x1, x2 = (
-                vehicles.rotors[i, j, 0],
-                vehicles.rotors[i, j, 1],
-                vehicles.rotors[i, j, 2],
-            )
+            x0 = vehicles.rotors[i, j, 0]
+            x1 = vehicles.rotors[i, j, 1]
+            x2 = vehicles.rotors[i, j, 2]
             w, spin = y[13 + j], vehicles.spin[i, j]
             u0, u1, u2 = b0 + Q * x2 - R * x1, b1 + R * x0 - P * x2, b2 + P * x1 - Q * x0
             h0, h1 = -k_d * w * u0, -k_d * w * u1

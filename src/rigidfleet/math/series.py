@@ -127,10 +127,8 @@ def angle_series(y: Floats, x: Floats) -> Floats:
     angles[0] = np.arctan2(y[0], x[0])
     size = x[0] ** 2 + y[0] ** 2
     safe = np.where(size > 0.0, size, np.inf)
-    turned, square = (
-        product(x[:-1], rate_series(y)) - product(y[:-1], rate_series(x)),
-        product(x, x) + product(y, y),
-    )
+    turned = product(x[:-1], rate_series(y)) - product(y[:-1], rate_series(x))
+    square = product(x, x) + product(y, y)
     rates = np.zeros_like(turned)  # angle' (x^2 + y^2) = x y' - y x'
     for k in range(len(turned)):
         rates[k] = (turned[k] - sum(rates[i] * square[k - i] for i in range(k))) / safe

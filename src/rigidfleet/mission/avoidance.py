@@ -22,7 +22,7 @@ _LEFT_OUT = 0.02
 
 
 def spare_accelerations(
-    models: Sequence[VehicleModel], gravity: float, disturbances: Disturbances | None
+    models: Sequence[VehicleModel], gravity: float, disturbances: Disturbances
 ) -> Floats:
     """Acceleration (N,) [m/s^2] that each vehicle has left in any direction, negative if none.
 
@@ -40,11 +40,9 @@ def spare_accelerations(
 
 
 def _disturbing_accelerations(
-    models: Sequence[VehicleModel], gravity: float, disturbances: Disturbances | None
+    models: Sequence[VehicleModel], gravity: float, disturbances: Disturbances
 ) -> Floats:
     """Acceleration (N,) [m/s^2] by wind, gusts of three standard deviations, and wrong masses."""
-    if disturbances is None:
-        return np.zeros(len(models))
     wind = float(np.linalg.norm(disturbances.wind))
     if disturbances.gusts is not None:
         wind += _SIGMAS * float(np.linalg.norm(gust_intensity(disturbances.gusts, wind)))
@@ -57,13 +55,12 @@ def _disturbing_accelerations(
     return np.array(by_wind) + np.where(error > 0.0, limit, gravity) * np.abs(error)
 
 
-def _noise_of(disturbances: Disturbances | None) -> Noise:
+def _noise_of(disturbances: Disturbances) -> Noise:
     """The noise of measurements, which may be none."""
-    noise = None if disturbances is None else disturbances.noise
-    return Noise.model_construct() if noise is None else noise
+    return disturbances.noise or Noise.model_construct()
 
 
-def reaction_times(models: Sequence[VehicleModel], disturbances: Disturbances | None) -> Floats:
+def reaction_times(models: Sequence[VehicleModel], disturbances: Disturbances) -> Floats:
     """Time (N,) [s] until a commanded force acts: a measurement's delay; of quadrotors also motors and attitude.
 
     The attitude loop follows a ramp late by k_omega / k_R.
@@ -78,7 +75,7 @@ def reaction_times(models: Sequence[VehicleModel], disturbances: Disturbances | 
 
 
 def lag_coefficients(
-    models: Sequence[VehicleModel], disturbances: Disturbances | None, gravity: float
+    models: Sequence[VehicleModel], disturbances: Disturbances, gravity: float
 ) -> Floats:
     """Lags (N, 3, 3) of `AvoidanceArrays.ahead`; 0 of points.
 
@@ -98,7 +95,7 @@ def lag_coefficients(
 
 
 def avoidance_margins(
-    table: Avoidance, models: Sequence[VehicleModel], disturbances: Disturbances | None
+    table: Avoidance, models: Sequence[VehicleModel], disturbances: Disturbances
 ) -> Floats:
     """By how much each vehicle is taken to be larger (N,) [m]: by noise, and by what lags leave out."""
     if table.margin is not None:
@@ -108,15 +105,13 @@ def avoidance_margins(
 
 
 def why_no_guarantee(
-    models: Sequence[VehicleModel], d: Disturbances | None, obstacles: Sequence[Any] = ()
+    models: Sequence[VehicleModel], d: Disturbances, obstacles: Sequence[Any] = ()
 ) -> str:
     """Why the guard's guarantee is no theorem for these vehicles and obstacles; empty if it is one."""
     if not all(model.point for model in models):
         return "quadrotors cannot brake at once"
     if any(thing.solid.moves for thing in obstacles):
         return "obstacles move"
-    if d is None:
-        return ""
     for applies, words in (
         (d.noise is not None, "states are measured with noise or late"),
         (any(d.wind) or d.gusts is not None, "the wind is not known"),
@@ -130,7 +125,7 @@ def why_no_guarantee(
 
 def avoidance_rules(m: Draft) -> Breaches:
     """[avoidance] acts, knows what it needs to know, and leaves vehicles something to brake with."""
-    a, d = m.avoidance, m.disturbances
+    a, d = m.avoidance, m.disturbances or Disturbances.model_construct()
     if a is None:
         return
     if not m.flies_vehicles:

@@ -18,7 +18,9 @@ from rigidfleet.math import falls
 from rigidfleet.math.bernstein import Measure, Measured, greatest_curve_measure
 from rigidfleet.math.piecewise import Piecewise, pad
 from rigidfleet.mission.model import Mission
+from rigidfleet.mission.obstacles import Obstacle, is_ground
 from rigidfleet.solids.polygons import Region, curve_middles
+from rigidfleet.solids.records import swept_extent
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: How far a worst value may be from the worst of the curve: of a fence, and of a fall [m].
@@ -80,8 +82,7 @@ class Boundaries:
     def __init__(self, mission: Mission) -> None:
         self.mission = mission
         self.radius, self.k = mission.fleet.radius, mission.drag / mission.true_mass
-        d = mission.disturbances
-        self.wind = np.array((0.0, 0.0, 0.0) if d is None else d.wind)
+        self.wind = np.array(mission.all_disturbances.wind)
         self.g = mission.gravity
         kind_of = [fence.kind for fence in mission.fences]
         self.every = [
@@ -110,14 +111,13 @@ class Boundaries:
         return falls.landing_places(r, v, tau, k, self.wind)
 
     def ends_of_falls(self, r: Floats, v: Floats) -> Floats:
-        """Where these falls end (K, N, 3) [m]: on the ground, or at z = 0 without one.
+        """Where these falls end (K, N, 3) [m]: on the ground, or without one at z = 0 or on what is below that.
 
         Terrain and roofs count at some heights of each fall.
         """
-        mission = self.mission
-        level = mission.ground if np.isfinite(mission.ground) else 0.0
-        terrain = [np.array(x.heights).min() for x in mission.solids if x.kind == "heights"]
-        level = min([level, *terrain])
+        mission, level = self.mission, self.mission.ground
+        if not np.isfinite(level):
+            level = min([0.0, *(_lowest_top(x) for x in mission.solids if is_ground(x))])
         ends = np.full(r.shape, level)
         ends[..., :2] = self.places_of_falls(r, v, level)
         for share in np.linspace(0.0, 1.0, _HEIGHTS) if mission.roofs.kind.size else ():
@@ -154,6 +154,14 @@ class Boundaries:
         way = speed * np.diff(tau, axis=1)
         more = (speed + spread[:, 1:]) * (np.diff(tau, axis=1) + early[:, 1:] + early[:, :-1])
         return -least_distance(away, way), np.full(len(m), 0.5), -least_distance(away - reach, more)
+
+
+def _lowest_top(thing: Obstacle) -> float:
+    """A height [m] below which nothing can lie on a terrain or a box."""
+    if thing.kind == "heights":
+        return float(np.array(thing.heights).min())
+    sides = thing.box_bounds  # of a turned box, no corner is known as one of its upper side
+    return float(swept_extent(thing.solid)[0, 2] if sides is None else sides[5])
 
 
 def _distance_outside(region: Region, inclusion: bool, curves: Floats, _: Ints) -> Measured:

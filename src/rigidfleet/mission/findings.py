@@ -50,10 +50,8 @@ class FindingCollector:
         findings = [*self._findings.values()]
         for kind, n in self._counts.items():
             if n > _MOST_OF_A_KIND:
-                problem, remedy = (
-                    f"{n - _MOST_OF_A_KIND:,} more of this kind",
-                    "correct all of them",
-                )
+                problem = f"{n - _MOST_OF_A_KIND:,} more of this kind"
+                remedy = "correct all of them"
                 findings.append(Finding(self.origin, _key_path(kind), None, problem, remedy))
         return findings
 

@@ -30,7 +30,7 @@ from rigidfleet.mission.files import lines_with_digests
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
 from rigidfleet.mission.phases import latest_end_of_phases
-from rigidfleet.mission.schema import DRAG, Aborting, Contents
+from rigidfleet.mission.schema import DRAG, Aborting, Contents, Disturbances
 from rigidfleet.mission.text import parse_toml, text_error
 from rigidfleet.mission.vehicles import VehicleModel, model_of_vehicle
 from rigidfleet.solids.distance import height_below
@@ -547,10 +547,14 @@ class Mission(Contents, Shown):
         return [models[name] for name in self.agents.vehicle]
 
     @cached_property
+    def all_disturbances(self) -> Disturbances:
+        """The disturbances; without the table, some that do nothing."""
+        return self.disturbances or Disturbances.model_construct()
+
+    @cached_property
     def true_mass(self) -> Floats:
         """True mass (N,) [kg] of each vehicle. The control laws use `agents.mass`."""
-        error = self.disturbances.mass_error if self.disturbances is not None else 0.0
-        return self.fleet.mass * (1.0 + np.array(error))
+        return self.fleet.mass * (1.0 + np.array(self.all_disturbances.mass_error))
 
     @cached_property
     def drag(self) -> Floats:
@@ -560,8 +564,8 @@ class Mission(Contents, Shown):
         """
         if self.vehicle_models is not None:
             return np.array([model.linear_drag[0] for model in self.vehicle_models])
-        d = self.disturbances
-        if d is None or (d.drag is None and not any(d.wind) and d.gusts is None):
+        d = self.all_disturbances
+        if d.drag is None and not any(d.wind) and d.gusts is None:
             return np.zeros(self.n_agents)
         if d.drag is None:
             return DRAG * self.fleet.mass
@@ -571,7 +575,7 @@ class Mission(Contents, Shown):
     def lost_at(self) -> Floats:
         """Time (N,) [s] at which each vehicle is lost; infinity for those that are not lost."""
         when = np.full(self.n_agents, np.inf)
-        for lost in self.disturbances.lost if self.disturbances is not None else ():
+        for lost in self.all_disturbances.lost:
             when[lost.agent - 1] = lost.time
         return when
 
@@ -634,7 +638,7 @@ class Mission(Contents, Shown):
     @property
     def on_loss(self) -> Literal["continue", "hold", "land", "abort"]:
         """What the others do when a vehicle or link is lost."""
-        return "continue" if self.disturbances is None else self.disturbances.on_loss
+        return self.all_disturbances.on_loss
 
 
 @lru_cache(64)

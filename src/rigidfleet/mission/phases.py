@@ -454,10 +454,8 @@ def _formation_use_rules(m: Draft, phases: Written) -> Breaches:
                 yield from _slot_blend_rules(shaping, form, m.n, path)
             held = shaping.formation
         form = forms.get(held) if held else None
-        tracked = p.tracks_slots and m.is_valid(path, "control")
+        tracked = p.tracks_slots and held not in slotted and m.is_valid(path, "control")
         if not tracked or m.n is None or form is None or not held or not has_no_findings(m, held):
-            continue
-        if held in slotted:
             continue
         if form.distances is not None and form.slot_array(m.n) is None:
             problem = f"formation '{held}' has no slots to track"

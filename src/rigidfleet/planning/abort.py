@@ -219,8 +219,9 @@ class Aborts:
         self.no_landing = why_no_landing(mission)
         self.need, widest = kept_distances(mission)[0], 2.0 * float(self.radius.max())
         # In flight both are off their ways, as far as the verdict allows, but for points that only steady air pushes.
-        allowed, most, d = limits.separation_allowance, limits.tracking_error, mission.disturbances
-        steady = d is None or (d.noise is None and d.gusts is None and not np.any(d.mass_error))
+        allowed, most = limits.separation_allowance, limits.tracking_error
+        d = mission.all_disturbances
+        steady = d.noise is None and d.gusts is None and not np.any(d.mass_error)
         self.off = 0.0 if steady and mission.vehicle_models is None else allowed
         if rotors and most is not None:
             self.off = 2.0 * most
@@ -394,8 +395,7 @@ class Aborts:
         if not mission.drag.any() or len(who) < 2:
             return self.off
         v = way.states(np.linspace(0.0, way.time[-1], _LOOKS), 2)[1][:, who]
-        d = mission.disturbances
-        push = airflow_force(mission, (np.zeros(3) if d is None else np.array(d.wind)) - v, who)
+        push = airflow_force(mission, np.array(mission.all_disturbances.wind) - v, who)
         if mission.tracking.drag_feedforward:
             push = push - airflow_force(mission, -v, who)
         push = push / (mission.fleet.mass[who, None] * mission.tracking_gains[0])

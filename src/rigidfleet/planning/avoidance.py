@@ -33,7 +33,7 @@ def avoidance_in_flight(
     drag = np.where([model.point for model in models], mission.drag / mass, 0.0)
     return avoidance.avoidance_arrays(
         period=flight.every * flight.steps * flight.h,
-        b=spare_accelerations(models, mission.gravity, mission.disturbances),
+        b=spare_accelerations(models, mission.gravity, mission.all_disturbances),
         lift=limit / mass,
         mass=mass,
         g=mission.gravity,
@@ -45,12 +45,12 @@ def avoidance_in_flight(
         separation=separation,
         clearance=settings.clearance,
         drag=drag,
-        lag=reaction_times(models, mission.disturbances),
-        ahead=lag_coefficients(models, mission.disturbances, mission.gravity),
+        lag=reaction_times(models, mission.all_disturbances),
+        ahead=lag_coefficients(models, mission.all_disturbances, mission.gravity),
         tilt=np.array(
             [np.inf if model.point else np.radians(model.tilt_limit_deg) for model in models]
         ),
-        spare=avoidance_margins(settings, models, mission.disturbances),
+        spare=avoidance_margins(settings, models, mission.all_disturbances),
         rate=settings.rate,
         share=settings.share,
         release=settings.release,
@@ -66,7 +66,7 @@ def kept_distances(mission: Mission) -> tuple[float, float]:
     limit = mission.limits.separation or 0.0
     if settings is None or models is None:
         return limit, 0.0
-    spare = float(avoidance_margins(settings, models, mission.disturbances).max())
+    spare = float(avoidance_margins(settings, models, mission.all_disturbances).max())
     separation = limit if settings.separation is None else settings.separation
     return max(limit, separation + 2.0 * spare), settings.clearance + spare
 

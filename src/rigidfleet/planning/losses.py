@@ -92,8 +92,7 @@ def answer_to_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequenc
 
 def loss_legs(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg]]) -> list[Leg]:
     """The legs of the phases by which the others brake, and hold or land (`answer_to_loss`)."""
-    d = mission.disturbances
-    assert d is not None
+    d = mission.all_disturbances
     rest = 0.0 if now.blend is None else now.blend.t0 + now.blend.T_b - now.t
     legs: list[Leg] = []
 

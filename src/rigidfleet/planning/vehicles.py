@@ -61,7 +61,7 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
     """Vehicles, air, sensing and rates of a mission with vehicles, where a user's force lasts two ``max_step`` [s]."""
     models = mission.vehicle_models
     assert models is not None
-    n, autopilot, d = len(models), mission.autopilot, mission.disturbances
+    n, autopilot, d = len(models), mission.autopilot, mission.all_disturbances
     made = [kernel_vehicle(model, m) for model, m in zip(models, mission.true_mass, strict=True)]
     # A force is held over each step: twenty of them meet a smooth pulse to 1 %
     longest = min(autopilot.step, _FORCED if max_step < math.inf else math.inf, max_step / 10.0)
@@ -81,8 +81,8 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
     same = ("wind", "gust_step", "gust", "floor", "radius", "roofs")
     air = flight.air._replace(
         **{name: getattr(around, name) for name in same},
-        downwash=d is not None and d.downwash,
-        ground_effect=d is not None and d.ground_effect,
+        downwash=d.downwash,
+        ground_effect=d.ground_effect,
         density=DENSITY,
         ground=mission.ground,
     )
@@ -97,8 +97,7 @@ def lags_by_vehicle(mission: Mission) -> list[Lag]:
     models = mission.vehicle_models
     if models is None:
         return []
-    d, autopilot = mission.disturbances, mission.autopilot
-    noise = None if d is None else d.noise
+    noise, autopilot = mission.all_disturbances.noise, mission.autopilot
     delay, rate = 0.0, autopilot.formation_rate
     if noise is not None:
         # Delays are whole ticks; a law that is quicker than its measurements acts at their rate.
@@ -184,8 +183,7 @@ def kernel_vehicle(model: VehicleModel, mass: float) -> fleet.VehicleDynamics:
 
 def _sensing_in_ticks(mission: Mission) -> fleet.Sensing:
     """Rate and delay of measurements, in whole ticks of the attitude control."""
-    n, rate, d = mission.n_agents, mission.autopilot.rate, mission.disturbances
-    noise = None if d is None else d.noise
+    n, rate, noise = mission.n_agents, mission.autopilot.rate, mission.all_disturbances.noise
     if noise is None:
         return fleet.exact_sensing(n)
     return fleet.Sensing(max(1, round(rate / noise.rate)), np.full(n, round(noise.delay * rate)))
@@ -244,8 +242,8 @@ def gilbert_transitions(loss: float, burst: float | None) -> tuple[float, float]
 
 def clocks_of(mission: Mission) -> VehicleClocks:
     """The clocks by which vehicles fly; one for all if the mission has neither [network.clocks] nor stuck vehicles."""
-    net, d, n = mission.network, mission.disturbances, mission.n_agents
-    clocks, stuck = None if net is None else net.clocks, () if d is None else d.stuck
+    net, stuck, n = mission.network, mission.all_disturbances.stuck, mission.n_agents
+    clocks = None if net is None else net.clocks
     if net is None or not (clocks or stuck):
         return shared_clock(n)
     rate = mission.autopilot.rate
@@ -271,10 +269,9 @@ class TickTables:
     """Tables of a flight for ranges of ticks: references of the attitude control, noise, dropped measurements."""
 
     def __init__(self, mission: Mission, flight: fleet.SampledFlight) -> None:
-        d = mission.disturbances
         self.flight, self.n = flight, mission.n_agents
         self.rate = mission.autopilot.rate
-        self.noise = None if d is None else d.noise
+        self.noise = mission.all_disturbances.noise
         self.yaw = commanded_yaw(mission)
         self.linear_drag = np.array([model.linear_drag for model in mission.vehicle_models or ()])
         self.compensated = mission.autopilot.delay_compensation

@@ -304,8 +304,9 @@ def draw_trajectory_from_above(ax: Axes, result: Result, view: Scene) -> None:
         name = ax.annotate(
             names, (x, y), (5, 4), textcoords="offset points", **_waypoint_name_look(result)
         )
-        beyond = max(name.get_window_extent().x1 - ax.bbox.x1, 0.0)
-        name.set_position((5 - 72 * beyond / ax.figure.dpi, 4))
+        # Within the axes, with its outline
+        beyond = np.subtract(name.get_window_extent().max, ax.bbox.max) * 72 / ax.figure.dpi + 2
+        name.set_position(tuple((5, 4) - np.maximum(beyond, 0.0)))
 
 
 def trajectory_legend_entries(result: Result, view: Scene) -> list[Any]:

@@ -71,10 +71,10 @@ def sampled_tracking_offsets(mission: Mission, way: list[PlannedPhase]) -> list[
 
 def _unmodelled_accelerations(mission: Mission, planned: PlannedPhase) -> Floats:
     """Acceleration (K, N, 3) [m/s^2] by forces that no law knows."""
-    d, v, mass = mission.disturbances, planned.velocity, mission.fleet.mass[:, None]
+    d, v, mass = mission.all_disturbances, planned.velocity, mission.fleet.mass[:, None]
     up = np.array([0.0, 0.0, 1.0])
-    air = np.zeros(3) if d is None else np.array(d.wind)
-    if d is not None and d.downwash and mission.n_agents <= STACKED:
+    air = np.array(d.wind)
+    if d.downwash and mission.n_agents <= STACKED:
         air = air - pair_jet_speeds(mission, planned.position).sum(axis=2)[..., None] * up
     force = airflow_force(mission, air - v)
     if mission.tracking.drag_feedforward:

@@ -166,8 +166,7 @@ def _jet_remarks(mission: Mission, way: Sequence[PlannedPhase]) -> Iterator[Rema
     if worst[0] < _BLOW:
         return
     _, push, flow, i, j, s, t, phase = worst
-    on = mission.disturbances is not None and mission.disturbances.downwash
-    rest = "" if on else "; set disturbances.downwash to fly with it"
+    rest = "" if mission.all_disturbances.downwash else "; set disturbances.downwash to fly with it"
     text = (
         f"agent {i + 1} is {s:.2f} m below agent {j + 1} at {t:.2f} s in '{phase}': its jet of {flow:.1f} m/s pushes"
         f" with {push:.2g} N, {100 * worst[0]:.0f} % of the weight{rest}"

@@ -88,8 +88,7 @@ def _fall_reach_sentences(result: Result, falls: Floats) -> list[str]:
     off = np.linalg.norm(falls - result.position[..., :2], axis=2)
     off = np.where(np.isfinite(off) & result.left, off, -1.0)
     k, i = np.unravel_index(int(off.argmax()), off.shape)
-    d = mission.disturbances
-    wind = 0.0 if d is None else math.hypot(*d.wind[:2])
+    wind = math.hypot(*mission.all_disturbances.wind[:2])
     air = f"in wind of {value(wind, 'm/s')}" if wind else "in still air"
     drag = "with the mission's drag" if mission.drag.any() else "without drag"
     low, high = np.nanmin(falls, axis=(0, 1)), np.nanmax(falls, axis=(0, 1))

@@ -61,10 +61,10 @@ def layers(mission: Mission) -> Settings | None:
 
     They can if obstacles move, no vehicle is lost, and no abort leaves the plan, of which all that follows is proved.
     """
-    settings, d = mission.avoidance, mission.disturbances
+    settings, lost = mission.avoidance, mission.all_disturbances.lost
     if settings is None or not (settings.clock or settings.body):
         return None
-    leaves = (d is not None and bool(d.lost)) or mission.abandons_at < np.inf
+    leaves = lost or mission.abandons_at < np.inf
     return None if leaves or not any(o.solid.moves for o in mission.obstacles) else settings
 
 

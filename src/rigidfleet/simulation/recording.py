@@ -196,9 +196,8 @@ def assemble_result(
     tau = flown.tau if flown is not None and flown.tau.size else None
     avoided = [piece.layers for piece in pieces if piece.layers is not None]
     layers = _concatenate_samples(avoided) if avoided else None
-    d = mission.disturbances
-    noisy = d is not None and d.noise is not None
-    airy = flown is not None or (d is not None and bool(mission.drag.any()))
+    noisy = mission.all_disturbances.noise is not None
+    airy = flown is not None or (mission.disturbances is not None and bool(mission.drag.any()))
     worst = [phase.extremes for phase in phases]
     names = *RECORDED, *(("disturbance_force",) if airy else ()), *(SEEN if noisy else ())
     recorded = partial(_forces_and_references, mission, pieces, time, flown)

@@ -222,8 +222,8 @@ def judging_mission(
         data["limits"] = {key: x for key, x in bounds.items() if key not in SOURCES}
         agents |= {"radius": list(own.agents.radius), "mass": list(own.agents.mass)}
         if own.people:  # what fails falls through the air of the mission
-            wind = (0.0, 0.0, 0.0) if own.disturbances is None else own.disturbances.wind
-            data["disturbances"] = {"wind": list(wind), "drag": own.drag.tolist()}
+            wind = list(own.all_disturbances.wind)
+            data["disturbances"] = {"wind": wind, "drag": own.drag.tolist()}
     else:
         for key in filter(SOURCES.get, limits or {}):
             problem = f"is judged by {SOURCES[key]}, which positions over time do not show"

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from rigidfleet._common.quantities import MOTIONS
+from rigidfleet._common.reading import Gaps, Interpolation
 from rigidfleet._common.text import first_few
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.math import proximity
@@ -39,6 +40,8 @@ PARTIAL = {"late": "s", "another": "", "stale": "", "bias": "m"}
 SETUP = {"rotated": "deg", "shifted": "m", "mirrored": "deg"}
 FLOWN = {"wind": "m/s", "links": "", "lost": ""}
 UNITS = PARTIAL | SETUP | FLOWN
+#: Keys that say how files are read.
+READING = "interpolation", "gaps", "units", "axes", "topic"
 #: Agents in a message.
 _AGENTS = re.compile(r"\bagent \d+|\bagents \d+(?:, \d+)* and \d+")
 _TURN = 2.0 * np.pi
@@ -63,6 +66,13 @@ class Drill(Part):
     vehicles: _Counts = key("of how many at once late, another, stale and bias are faults", (1, 5))
     trials: AgentNumber = key("trials of each magnitude: other vehicles, directions, times", 20)
     files: tuple[str, ...] = key("files of others that are flown, not those of the mission", ())
+    interpolation: Interpolation = key("between samples of files: cubic or linear", "cubic")
+    gaps: Gaps = key(
+        "times without samples in files, longer than ten usual steps: refuse or bridge", "refuse"
+    )
+    units: str | None = key("units of a table's columns that do not name theirs: 'ms,mm,deg'")
+    axes: str | None = key("where x, y and z of a table point: 'enu', 'ned', ...")
+    topic: tuple[str, ...] = key("topics of a log that have positions; default: chosen", ())
 
     def case_grids(self, n: int) -> list[Variation]:
         """The cases of a show of n vehicles as three grids that go together: a drill is a sweep over them."""
@@ -89,6 +99,11 @@ class Drill(Part):
         named = [*map(Path, self.files + self.stale)]
         paths = sorted(p for path in named for p in (path, *path.rglob("*")) if p.is_file())
         return hashlib.sha256(b"".join(p.read_bytes() for p in paths)).hexdigest() if paths else ""
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """How its files are read: options of `foreign.files.read_trajectories`."""
+        return {name: getattr(self, name) for name in READING}
 
     def with_files_in_folder(self, folder: Path) -> Drill:
         """The same, with files as seen from a folder; names of shipped missions stay."""
@@ -247,7 +262,9 @@ class Show:
         from rigidfleet.simulation.trajectories import NAMES, result_of_trajectories
 
         if files:
-            read = read_trajectories(files, spans="stand", origin=self._origin)
+            read = read_trajectories(
+                files, spans="stand", origin=self._origin, **self.drill.reading
+            )
             self._origin = self._origin or read.read[0].get("origin")
             if len(read.curves) != self.n:
                 raise RigidfleetError(

@@ -173,12 +173,12 @@ def _merge_keys(document: dict[str, Any], assume: Mapping[str, Any]) -> dict[str
 
 def _seed_paths(mission: Mission) -> list[str]:
     """Paths of the seeds of the random numbers that act on a mission's flight."""
-    d, net = mission.disturbances, mission.network
-    noise, gusts = (None, None) if d is None else (d.noise, d.gusts)
+    d, net = mission.all_disturbances, mission.network
+    noise = d.noise
     acting = {
         "disturbances.noise": noise is not None
         and bool(noise.position or noise.velocity or noise.dropped),
-        "disturbances.gusts": gusts is not None,
+        "disturbances.gusts": d.gusts is not None,
         "network": net is not None and bool(net.loss or net.jitter),
     }
     return [f"{name}.seed" for name, acts in acting.items() if acts]
@@ -221,12 +221,8 @@ class _Study:
         self.flown: dict[tuple[float, ...], Flown] = {}
         self.slacks: dict[tuple[float, ...], float] = {}
         self.rounds = 0
-        self.begun, self.total, self.count, self.progress = (
-            perf_counter(),
-            budget,
-            workers,
-            progress,
-        )
+        self.begun, self.total = perf_counter(), budget
+        self.count, self.progress = workers, progress
         #: Numbers of runs that are done, flown and failed: of the sweeps before, and of the present one.
         self.before = self.now = np.zeros(3, dtype=np.int64)
         self.stack = ExitStack()

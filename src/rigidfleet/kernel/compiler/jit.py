@@ -104,10 +104,8 @@ class _CacheFolder(UserProvidedCacheLocator):
     """The cache folder of a function: that of the kernel."""
 
     def __init__(self, function: FunctionType) -> None:
-        self._py_file, self._lineno = (
-            function.__code__.co_filename,
-            function.__code__.co_firstlineno,
-        )
+        code = function.__code__
+        self._py_file, self._lineno = code.co_filename, code.co_firstlineno
         self._cache_path = str(cache_directory())
 
     def ensure_cache_path(self) -> None:

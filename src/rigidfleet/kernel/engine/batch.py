@@ -305,11 +305,8 @@ def fly_all(
     def make_vector_worker() -> Callable[..., None]:
         K = np.zeros((lane_steps.ROWS, n, WIDTH))
         K[lane_steps.ATOL] = atol[:, None]
-        y, clock, counts = (
-            pack_lanes(np.zeros((n, WIDTH))),
-            np.zeros(3),
-            np.zeros(FIRST_ROW + 1, dtype=np.int64),
-        )
+        y, clock = pack_lanes(np.zeros((n, WIDTH))), np.zeros(3)
+        counts = np.zeros(FIRST_ROW + 1, dtype=np.int64)
         state = IntegratorState(y, pack_lanes(K), clock, counts, rtol, NO_TRAIL)
         own = ready._replace(
             before=empty_lanes(ready.before.shape), known=empty_lanes(ready.known.shape), time=ready.time.copy(),

@@ -147,10 +147,8 @@ def _prepare_unrolled(
         code = Code(trace())
         _KNOWN[name] = code, _compile(code, name), _compile_flight_constants(code, name)
     code, address, before = _KNOWN[name]
-    uniform, distinct = (
-        simd.empty_lanes((len(code.inputs),)),
-        simd.pack_lanes(np.broadcast_to(values, (len(values), WIDTH))),
-    )
+    uniform = simd.empty_lanes((len(code.inputs),))
+    distinct = simd.pack_lanes(np.broadcast_to(values, (len(values), WIDTH)))
     before(distinct.ctypes.data, uniform.ctypes.data)
     reference, none = problem.reference, simd.empty_lanes((0, 1))
     lanes = lambda count: simd.empty_lanes((count,))  # noqa: E731

@@ -78,14 +78,6 @@ HALF = np.array(
 _AA, _EA, _HALF_A = A @ A, E @ A, HALF @ A
 
 
-@jit
-def forget_stages(k, first):
-    """As `dopri5.forget_stages`."""
-    for s in range(first, STAGES):
-        for q in range(k.shape[1]):
-            k[s, q] = fill_lanes(0.0)
-
-
 @jit_inline
 def _weighted_stage_sum(k, q, w, first, end):
     """Sum of w_j k[j, q] over stage 0 and the stages from ``first`` to before ``end``, literals."""
@@ -287,7 +279,6 @@ INSTEAD = {
     "STATE": STATE,
     "TRIAL": TRIAL,
     "write_stage_state": write_stage_state,
-    "forget_stages": forget_stages,
     "write_step_samples": write_step_samples,
     "record_start_forces": record_start_forces,
     "squared_errors": squared_errors,
