@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigidfleet._common.quantities import Quantity
+from rigidfleet._common.quantities import Quantity, quantity
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import CheckResult, Extreme, limit_check, value
 from rigidfleet.result import Result
@@ -93,7 +93,7 @@ def _avoidance_share_notes(result: Result) -> Iterator[str]:
 def _least_guarantee_margins(measured: Measurements, ending: str = "") -> list[Extreme]:
     """The least margins of each phase, between vehicles and to obstacles, or the first negative ones ("_lost")."""
     return [
-        measured.extreme_of(name + ending, p.extremes[name + ending], p.name)
+        measured.extreme_of(quantity(name + ending), p.extremes[name + ending], p.name)
         for p in measured.result.phases
         for name in ("guarantee", "clearance_guarantee")
         if name + ending in p.extremes
