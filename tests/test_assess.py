@@ -248,7 +248,7 @@ def test_a_quarter_turn_is_not_yet_flipped(flip, words):
     """At 90 deg itself the check passes and says so; its words and its outcome are never at odds."""
     mission = a_mission(TRIANGLE, 3)
     measured = Measurements(flown(mission, slots(mission, "triangle") + HEIGHT))
-    phases = [replace(p, flip=flip) for p in measured.phase_verdicts()]
+    phases = [p._replace(flip=flip) for p in measured.phase_verdicts()]
     (check,) = [c for c in all_checks(measured, phases) if c.check == "flip"]
     assert check.passed == (words == "has not flipped")
     assert words in check.message
@@ -964,7 +964,8 @@ def test_judging_is_light():
 
 def _fit(p: Floats, slots: Floats) -> Fit:
     """The fit of slots to agents (N, 3) at one sample."""
-    return next(fits_by_sample(p[None], shape_of_slots(slots), np.arange(len(p)), float))
+    shape = shape_of_slots(slots)
+    return next(fits_by_sample(p[None], [shape], np.arange(len(p)), [shape[-1]]))
 
 
 @pytest.mark.parametrize("flown", ["near", "mirrored", "larger", "exchanged", "scattered"])

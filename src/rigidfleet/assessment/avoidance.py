@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
-from rigidfleet._common.quantities import Quantity
+from rigidfleet._common.quantities import Quantity, quantity
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import CheckResult, Extreme, limit_check, value
 from rigidfleet.result import Result
@@ -34,7 +33,7 @@ def guarantee_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResul
     spare = "no vehicle has come near anything"
     if e is not None:
         spare = f"{value(e.value, 'm')} to spare at least"
-        e = replace(e, value=max(e.value, 0.0))
+        e = e._replace(value=max(e.value, 0.0))
     words = f"the guarantee of [avoidance] is {state}: {spare}"
     yield limit_check(q, e, 0.0, words, passed=True)
 
@@ -94,7 +93,7 @@ def _avoidance_share_notes(result: Result) -> Iterator[str]:
 def _least_guarantee_margins(measured: Measurements, ending: str = "") -> list[Extreme]:
     """The least margins of each phase, between vehicles and to obstacles, or the first negative ones ("_lost")."""
     return [
-        measured.extreme_of(name + ending, p.extremes[name + ending], p.name)
+        measured.extreme_of(quantity(name + ending), p.extremes[name + ending], p.name)
         for p in measured.result.phases
         for name in ("guarantee", "clearance_guarantee")
         if name + ending in p.extremes

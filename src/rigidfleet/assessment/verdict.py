@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from rigidfleet._common.facts import (
     Fact,
@@ -54,8 +54,12 @@ _PRAISE = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Extreme:
+def _by_name(row: Any) -> dict[str, Any]:
+    """The fields of a row of a verdict by name, as JSON has them."""
+    return row._asdict()
+
+
+class Extreme(NamedTuple):
     """Worst value of a quantity: how much, when [s], who, and in which phase; whether it is known at samples alone."""
 
     value: float
@@ -63,10 +67,10 @@ class Extreme:
     who: str
     phase: str
     at_samples: bool = False
+    data = _by_name
 
 
-@dataclass(frozen=True, slots=True)
-class CheckResult:
+class CheckResult(NamedTuple):
     """One check.
 
     Attributes
@@ -101,6 +105,7 @@ class CheckResult:
     first: Extreme | None = None
     interval: tuple[float, float] | None = None
     undecided: bool = False
+    data = _by_name
 
     @property
     def name(self) -> str:
@@ -133,8 +138,7 @@ class CheckResult:
         return words.format(worst=worst, limit=limit, who=self.who)
 
 
-@dataclass(frozen=True, slots=True)
-class Waypoint:
+class Waypoint(NamedTuple):
     """Miss of a waypoint at its time [s]: [m], [m/s], [deg], [deg/s]; None for what it does not specify."""
 
     time: float
@@ -142,10 +146,10 @@ class Waypoint:
     velocity: float | None
     attitude: float | None
     rates: float | None
+    data = _by_name
 
 
-@dataclass(frozen=True, slots=True)
-class PhaseVerdict:
+class PhaseVerdict(NamedTuple):
     """Numbers of one phase; None where they do not apply.
 
     Attributes
@@ -183,6 +187,7 @@ class PhaseVerdict:
     through: tuple[Waypoint, ...]
     stay: Waypoint | None
     worst: dict[str, Extreme]
+    data = _by_name
 
 
 def keeps_limit(q: Quantity, worst: float, limit: float) -> bool:
@@ -209,12 +214,11 @@ def limit_check(
             q.name, True, words, None, limit, q.unit, at_least, judged=limit is not None
         )
     if not words:
-        bound = "" if limit is None else f" (limit {limit:g} {q.unit})"
-        words = (
-            q.words or f"greatest {q.name_in_words} {{worst}}, {{who}}, at {{when:.2f}} s{bound}"
-        )
         worst = value(e.value, q.unit)
-        words = words.format(worst=worst, who=e.who, when=e.when, limit=limit)
+        words = q.words.format(worst=worst, who=e.who, when=e.when, limit=limit)
+    if not words:
+        bound = "" if limit is None else f" (limit {limit:g} {q.unit})"
+        words = f"greatest {q.name_in_words} {worst}, {e.who}, at {e.when:.2f} s{bound}"
     if e.at_samples:
         words += ", at samples"
     if passed is None and limit is not None:

@@ -150,6 +150,8 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
 
     def height(d: Floats, radii: Floats) -> Floats:
         overlap = d[0] ** 2 + d[1] ** 2 <= radii**2  # false for agents without a position
+        if not overlap.any():
+            return np.broadcast_to(np.inf, overlap.shape)
         return np.where(overlap & np.isfinite(d[2]), np.abs(d[2]) - radii, np.inf)
 
     return _least_of_pairs(r, radius, height)
@@ -282,13 +284,8 @@ def _update_nearest(
         far = least + radius if thing.solid.kind[0] in _SURFACES else np.inf
         clearance = distances(*places, thing.solid, time, far)
         clearance -= radius
-        closer = clearance < least  # false for NaN
-        if closer.all():
-            least[...] = clearance
-            nearest.fill(k)
-        elif closer.any():
-            np.copyto(least, clearance, where=closer)
-            np.copyto(nearest, k, where=closer)
+        np.putmask(nearest, clearance < least, k)
+        np.fmin(least, clearance, out=least)  # NaN is no distance
 
 
 def distances(

@@ -129,7 +129,8 @@ def _failures_and_metrics(
         slots = mission.formation_slots(formation)
         if slots is None or len(slots) < 2:
             continue
-        fits = [*fits_by_sample(r, shape_of_slots(slots), np.arange(len(slots)), allowed)]
+        shape, who = shape_of_slots(slots), np.arange(len(slots))
+        fits = [*fits_by_sample(r, [shape] * count, who, [allowed(shape[-1])] * count)]
         metrics["shape_end"] = error = np.array([fit.error for fit in fits])
         metrics["shape"] = np.fmax(metrics["shape"], error)
         misshapen = error > fits[0].limit
