@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -646,6 +647,12 @@ def test_vehicles_may_land_where_they_stood(tmp_path: Path) -> None:
     assert others > 5
     said = f"{others} of 12 {words}: {', '.join(where[:5])} and {others - 5} more"
     assert said in str(rf.assess(result).notes)
+    gone = where[0].split()[0]  # one of them has no position at the end: the others are told all the same
+    position = result.position.copy()
+    position[-1, int(gone) - 1] = np.nan
+    verdict = rf.assess(replace(result, position=position))
+    assert f"{others - 1} of 12 {words}: {where[1]}" in str(verdict.notes)
+    assert f"the position of agent {gone} is not finite" in verdict.summary
     result.save(tmp_path / "show.nc")
     assert main(["export", str(tmp_path / "show.nc"), "--format", "setpoints"]) == 0
     data["phases"][-1]["places"] = "own"

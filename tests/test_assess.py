@@ -248,7 +248,7 @@ def test_a_quarter_turn_is_not_yet_flipped(flip, words):
     """At 90 deg itself the check passes and says so; its words and its outcome are never at odds."""
     mission = a_mission(TRIANGLE, 3)
     measured = Measurements(flown(mission, slots(mission, "triangle") + HEIGHT))
-    phases = [p._replace(flip=flip) for p in measured.phase_verdicts()]
+    phases = [replace(p, flip=flip) for p in measured.phase_verdicts()]
     (check,) = [c for c in all_checks(measured, phases) if c.check == "flip"]
     assert check.passed == (words == "has not flipped")
     assert words in check.message

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,7 +34,7 @@ def guarantee_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResul
     spare = "no vehicle has come near anything"
     if e is not None:
         spare = f"{value(e.value, 'm')} to spare at least"
-        e = e._replace(value=max(e.value, 0.0))
+        e = replace(e, value=max(e.value, 0.0))
     words = f"the guarantee of [avoidance] is {state}: {spare}"
     yield limit_check(q, e, 0.0, words, passed=True)
 

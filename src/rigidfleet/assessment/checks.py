@@ -322,7 +322,7 @@ def _separation_certificate_check(measured: Measurements, q: Quantity) -> Iterat
             f"in phase '{phase}' {_separation_in_words(e)};"
             f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
         )
-        yield limit_check(q, e._replace(value=nearer), allowed, words)
+        yield limit_check(q, replace(e, value=nearer), allowed, words)
 
 
 def _abort_separation_check(measured: Measurements) -> Iterator[CheckResult]:
@@ -443,7 +443,7 @@ def _thrust_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]
     own = {f"agent {i + 1}": most for i, most in enumerate(limits.tolist())}
     if e.value - own[e.who] < beyond.value:
         yield limit_check(quantity("thrust_peak"), e, None)
-        e = beyond._replace(value=beyond.value + own[beyond.who])
+        e = replace(beyond, value=beyond.value + own[beyond.who])
     yield limit_check(q, e, own[e.who])
 
 

@@ -166,13 +166,13 @@ def verdict_with_intervals(
         name, why = check.check, "" if deviations else "the noise is not told. State it: --noise"
         if not common_clock and _is_of_pairs(name):
             why = "vehicles have no common clock"
-            check = check._replace(worst=None, first=None)  # noqa: PLW2901
+            check = replace(check, worst=None, first=None)  # noqa: PLW2901
         if deviations and not why and name not in (*_CERTAIN, *_UNSEEN):
             check = _with_interval(check, deviations.uncertainty_of(check), facts["noise_m"])  # noqa: PLW2901
             check = _leave_open_at_reset(check, resets)  # noqa: PLW2901
         elif why and check.judged and name not in _CERTAIN:
             words = f"{name.replace('_', ' ')} is not judged: {why}"
-            check = check._replace(passed=False, undecided=True, message=words)  # noqa: PLW2901
+            check = replace(check, passed=False, undecided=True, message=words)  # noqa: PLW2901
         checks += [check] * (name not in _UNSEEN)
     return replace(verdict, checks=checks, doubt=facts, notes=[*doubt_notes(facts), *verdict.notes])
 
@@ -183,20 +183,20 @@ def _with_interval(check: CheckResult, by: float, sigma: float) -> CheckResult:
     if worst is None:
         sure = by == 0.0 or check.passed
         words = "" if sure else ": undecided, as vehicles may be where others seem to be"
-        return check._replace(undecided=not sure, message=check.message + words)
+        return replace(check, undecided=not sure, message=check.message + words)
     at_least = check.at_least or quantity(check.check).at_least
     low, high = worst - by, worst + by
     low = low if at_least or worst < 0.0 else max(low, 0.0)
     words = f"{check.message}; {value(low)} to {value(high)} {check.unit}".rstrip()
-    check = check._replace(interval=(low, high), message=words)
+    check = replace(check, interval=(low, high), message=words)
     if not check.judged or limit is None:
         return check
     sense = replace(quantity(check.check), sense="least" if at_least else "greatest")
     worse, better = (low, high) if at_least else (high, low)
     if keeps_limit(sense, worse, limit):
-        return check._replace(passed=True)
+        return replace(check, passed=True)
     if not keeps_limit(sense, better, limit):
-        return check._replace(passed=False)
+        return replace(check, passed=False)
     # The interval is then to be shorter than the way to the limit, which another log finds a little nearer.
     # All of what is there may be noise, which then is less, too.
     share = min(abs(worst - limit) / by, limit / high if low == 0.0 else math.inf)
@@ -206,7 +206,7 @@ def _with_interval(check: CheckResult, by: float, sigma: float) -> CheckResult:
         remedy += f", or, if it is white, {math.ceil(1.0 / less)} times the rate"
     words = re.sub(" is (missed|met),", " may be missed,", words)
     words = words.replace(" is not reached", " may not be reached")
-    return check._replace(passed=False, undecided=True, message=f"{words}: undecided; {remedy}")
+    return replace(check, passed=False, undecided=True, message=f"{words}: undecided; {remedy}")
 
 
 def _leave_open_at_reset(check: CheckResult, resets: list[float]) -> CheckResult:
@@ -215,7 +215,7 @@ def _leave_open_at_reset(check: CheckResult, resets: list[float]) -> CheckResult
     if check.passed or check.undecided or not near:
         return check
     words = f"{check.message}: undecided, as an estimator moves its position at {near[0]:.2f} s"
-    return check._replace(undecided=True, message=words)
+    return replace(check, undecided=True, message=words)
 
 
 def uncertainty_facts(

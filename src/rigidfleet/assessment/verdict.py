@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 from rigidfleet._common.facts import (
     Fact,
@@ -54,12 +54,8 @@ _PRAISE = {
 }
 
 
-def _by_name(row: Any) -> dict[str, Any]:
-    """The fields of a row of a verdict by name, as JSON has them."""
-    return row._asdict()
-
-
-class Extreme(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Extreme:
     """Worst value of a quantity: how much, when [s], who, and in which phase; whether it is known at samples alone."""
 
     value: float
@@ -67,10 +63,10 @@ class Extreme(NamedTuple):
     who: str
     phase: str
     at_samples: bool = False
-    data = _by_name
 
 
-class CheckResult(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class CheckResult:
     """One check.
 
     Attributes
@@ -105,7 +101,6 @@ class CheckResult(NamedTuple):
     first: Extreme | None = None
     interval: tuple[float, float] | None = None
     undecided: bool = False
-    data = _by_name
 
     @property
     def name(self) -> str:
@@ -138,7 +133,8 @@ class CheckResult(NamedTuple):
         return words.format(worst=worst, limit=limit, who=self.who)
 
 
-class Waypoint(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Waypoint:
     """Miss of a waypoint at its time [s]: [m], [m/s], [deg], [deg/s]; None for what it does not specify."""
 
     time: float
@@ -146,10 +142,10 @@ class Waypoint(NamedTuple):
     velocity: float | None
     attitude: float | None
     rates: float | None
-    data = _by_name
 
 
-class PhaseVerdict(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class PhaseVerdict:
     """Numbers of one phase; None where they do not apply.
 
     Attributes
@@ -187,7 +183,6 @@ class PhaseVerdict(NamedTuple):
     through: tuple[Waypoint, ...]
     stay: Waypoint | None
     worst: dict[str, Extreme]
-    data = _by_name
 
 
 def keeps_limit(q: Quantity, worst: float, limit: float) -> bool:

@@ -520,16 +520,16 @@ class Mission(Contents, Shown):
     def landing_swaps_in_words(self, end: Floats) -> str:
         """Which vehicles land where which other one stood, of those at ``end`` (N, 3) [m]; "" if none does."""
         start, stand = self.fleet.position, self.is_standing(end)
-        if len(end) < 2 or not stand.any() or not (self.is_standing(start) & stand).any():
+        if len(end) < 2 or not (self.is_standing(start) & stand).any():
             return ""
         from scipy.spatial import KDTree
 
-        pads = KDTree(start[:, :2])
-        far, near = pads.query(end[:, :2])
+        pads, standing = KDTree(start[:, :2]), np.flatnonzero(stand)  # none without a position
+        far, near = pads.query(end[standing, :2])
         # A place reaches half the way to the next one.
         there = far < 0.5 * pads.query(start[near, :2], 2)[0][:, 1]
-        others = np.flatnonzero(stand & there & (near != np.arange(len(end))))
-        who = first_few([f"{i + 1} where {near[i] + 1} did" for i in others])
+        others = np.flatnonzero(there & (near != standing))
+        who = first_few([f"{standing[k] + 1} where {near[k] + 1} did" for k in others])
         words = f"{len(others)} of {len(end)} vehicles land where another one stood: {who}"
         return words if others.size else ""
 
