@@ -647,7 +647,9 @@ def test_vehicles_may_land_where_they_stood(tmp_path: Path) -> None:
     assert others > 5
     said = f"{others} of 12 {words}: {', '.join(where[:5])} and {others - 5} more"
     assert said in str(rf.assess(result).notes)
-    gone = where[0].split()[0]  # one of them has no position at the end: the others are told all the same
+    gone = where[0].split()[
+        0
+    ]  # one of them has no position at the end: the others are told all the same
     position = result.position.copy()
     position[-1, int(gone) - 1] = np.nan
     verdict = rf.assess(replace(result, position=position))
