@@ -34,7 +34,7 @@ from rigidfleet.math import rigid_body
 from rigidfleet.math.constraint_jacobian import smallest_singular_value
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.mission.text import GROUPS
-from rigidfleet.planning.reference import slot_change
+from rigidfleet.planning.reference import shift_and_rotvec
 from rigidfleet.result import Result
 from rigidfleet.rigidity import RigidityClass, analyse, jacobian
 from rigidfleet.simulation.flight import simulate
@@ -315,7 +315,7 @@ def singular_on_the_way(case: Case, edges: Ints) -> int:
     J and the six rigid motions make a square matrix: its determinant changes sign there.
     """
     before, after = rigid_body.centred(case.start), rigid_body.centred(case.slots)
-    dp = slot_change(before, after, np.ones(case.n))[0]
+    dp = shift_and_rotvec(before, after, np.ones(case.n))[0]
     signs = []
     for s in np.linspace(0.0, 1.0, 200):
         p = before + s * dp

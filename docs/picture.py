@@ -26,7 +26,7 @@ from rigidfleet.plotting import encode_figure
 from rigidfleet.plotting.style import apply_style
 from rigidfleet.simulation.trajectories import result_of_trajectories
 from rigidfleet.sweep import Sweep, fly
-from rigidfleet.sweep.figures import failure_share_figure, map_over_two
+from rigidfleet.sweep.figures import drill_failure_figure, map_over_two
 
 IMAGES = Path(__file__).parent / "images"
 MISSION = "narrow-passage"
@@ -120,7 +120,7 @@ def drill() -> None:
     with TemporaryDirectory() as folder:
         table = fly(sweep, folder, workers=2)
     with apply_style():
-        figure = failure_share_figure(table)
+        figure = drill_failure_figure(table)
         assert figure is not None
         picture = encode_figure(figure, ["png"])["png"]
     _save_with_few_colours(io.BytesIO(picture), "drill")

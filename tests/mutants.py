@@ -505,8 +505,8 @@ def fly_with(plain: str) -> None:
     def record(address: int, p: Any, w: Any, segment: int, out: int) -> None:
         kind(address)(packing.pack(p).address, packing.pack(w).address, segment, out)
 
-    def bound_distance_changes(watch: Any, problem: Any, state: Any) -> None:
-        monitor.bound_distance_changes(problem, state, watch.monitor)
+    def write_first_step_change_bounds(watch: Any, problem: Any, state: Any) -> None:
+        monitor.write_first_step_change_bounds(problem, state, watch.monitor)
 
     def search_distances(watch: Any, problem: Any, state: Any, first: int, end: int) -> None:
         monitor.watch_trail_distances(first, end, problem, state, watch.monitor)
@@ -533,7 +533,7 @@ def fly_with(plain: str) -> None:
     replace(native.Watch, "search_clearances", search_clearances)
     if plain == "monitor":
         replace(monitor, "call_recorder", record)
-        for function in (bound_distance_changes, search_distances, search_forces):
+        for function in (write_first_step_change_bounds, search_distances, search_forces):
             replace(native.Watch, function.__name__, function)
     else:
         call = kind(avoid)

@@ -58,7 +58,7 @@ def base(tmp_path, monkeypatch) -> Iterator[Path]:
     monkeypatch.setattr(native, "_compile_part", lambda _: [code(OWN)])
     monkeypatch.setattr(native, "_loaded", {})
     file = native._cache_file("flight")
-    file.write_bytes(objects.join_object_codes([code(PLANTED)]))
+    file.write_bytes(objects.pack_object_codes([code(PLANTED)]))
     file.chmod(0o600)
     forget()
     yield folder

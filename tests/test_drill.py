@@ -284,7 +284,7 @@ def test_a_drill_is_a_sweep_over_its_faults(drilled):
 def test_the_worst_run_of_each_fault_is_drawn(drilled):
     """Dots are where two vehicles come as near as the words of the run say, or one crosses a fence, at that time."""
     _, _, table = drilled
-    figure = figures.worst_run_maps(table)
+    figure = figures.worst_runs_from_above(table)
     assert figure is not None
     worst = {}
     for case in (case for case in failure_rates(table) if case.worst):
@@ -325,7 +325,7 @@ def test_the_summary_has_the_share_of_each_fault(drilled):
             assert case["worst"]["run"] in failed
             assert case["worst"]["detail"] == table.detail[case["worst"]["run"]]
     assert {0, 3} & {case["failed"]["count"] for case in data}
-    figure = figures.failure_share_figure(table)
+    figure = figures.drill_failure_figure(table)
     assert figure is not None
     heights = [bar.get_height() for ax in figure.axes if ax.containers for bar in ax.containers[0]]
     assert heights == pytest.approx([100 * case["failed"]["rate"] for case in data])

@@ -26,7 +26,7 @@ import rigidfleet as rf
 from rigidfleet import interchange
 from rigidfleet.cli.app import main
 from rigidfleet.interchange import FORMATS, FormatName, export
-from rigidfleet.interchange.curves import exported_motion, fit_curves
+from rigidfleet.interchange.curves import fit_curves, motion_and_is_cut
 from rigidfleet.result import VARIABLES
 
 N, END, W = 4, 20.0, 0.5
@@ -548,7 +548,7 @@ def test_pieces_are_as_long_as_the_tolerance_allows(flight):
 
     SciPy makes the same pieces from the closed form's derivatives, and the closed form says how far off they are.
     """
-    exported, _ = exported_motion(flight, flown=False)
+    exported, _ = motion_and_is_cut(flight, flown=False)
     for agent, curve in enumerate(fit_curves(exported.curve_chunks(), 1e-3, yaw_tolerance=10.0)):
         time = np.unique(flight.time.round(9))
         at = np.searchsorted(time, curve.time.round(9))

@@ -29,7 +29,7 @@ class Steps:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.rows: list[tuple[float, float, np.ndarray]] = []
-        take = watching.Extremes.monitor_steps
+        take = watching.Extremes.search_trail_for_extremes
 
         def spy(extremes: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
             seen = int(extremes.monitor.monitor.count[STAYED])
@@ -39,7 +39,7 @@ class Steps:
                 self.rows.append((t, h, state.trail.points[row].copy()))
             take(extremes, problem, work, state, last=last)
 
-        monkeypatch.setattr(watching.Extremes, "monitor_steps", spy)
+        monkeypatch.setattr(watching.Extremes, "search_trail_for_extremes", spy)
 
     def positions(self, n: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
         """Times (K,) and positions (K, N, 3) of agents in all steps; of the inertial formulation."""
@@ -339,7 +339,11 @@ def test_agents_that_are_passed_over_are_neither_highest_nor_lowest_nor_fastest(
 @pytest.mark.parametrize("formulation", ["inertial", "body"])
 def test_no_distance_changes_more_than_its_bound(formulation, monkeypatch):
     """In space and as seen from above, at nine points of each step; what turns as one body has small bounds."""
-    call, found, mission = watching.native.Watch.bound_distance_changes, [], a_crowd(formulation)
+    call, found, mission = (
+        watching.native.Watch.write_first_step_change_bounds,
+        [],
+        a_crowd(formulation),
+    )
     n = mission.n_agents
     i, j = np.triu_indices(n, 1)
     basis = bernstein_basis(np.linspace(0.0, 1.0, 9))
@@ -357,7 +361,7 @@ def test_no_distance_changes_more_than_its_bound(formulation, monkeypatch):
         way = np.linalg.norm(x[-1] - x[0], axis=1).max()
         found.append((*changes, *watch.monitor.moves, way, state.trail.clock[0, 0]))
 
-    monkeypatch.setattr(watching.native.Watch, "bound_distance_changes", spy)
+    monkeypatch.setattr(watching.native.Watch, "write_first_step_change_bounds", spy)
     simulate(mission)
     space, above, bound, bound_above, way, t = np.array(found).T
     assert (space <= bound + 1e-9).all()
@@ -498,7 +502,7 @@ def test_to_watch_a_large_formation_does_not_change_its_flight(form, monkeypatch
     def pass_over(extremes: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
         state.count[TRAILED] = 0
 
-    monkeypatch.setattr(watching.Extremes, "monitor_steps", pass_over)
+    monkeypatch.setattr(watching.Extremes, "search_trail_for_extremes", pass_over)
     alone = simulate(mission)
     assert not alone.phases[0].extremes
     assert (watched.position == alone.position).all()
@@ -520,7 +524,7 @@ def test_extremes_of_a_large_formation_depend_on_no_pause_and_no_sample(monkeypa
 def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, monkeypatch):
     """Another thread, while the flight goes on, or this one, while it waits: the same to the bit."""
     mission = a_sphere(solver)
-    threads, take = set(), watching.Extremes.monitor_steps
+    threads, take = set(), watching.Extremes.search_trail_for_extremes
 
     def spy(*given: Any, **options: Any) -> None:
         threads.add(threading.get_ident())
@@ -534,12 +538,12 @@ def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, mon
                 flight.deepest_contact()
         return flight.finish()
 
-    monkeypatch.setattr(watching.Extremes, "monitor_steps", spy)
+    monkeypatch.setattr(watching.Extremes, "search_trail_for_extremes", spy)
     aside, looked = simulate(mission), flown()
     assert len(threads) > 1, "each phase's last steps are taken here"
 
     def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> None:
-        extremes.monitor_steps(problem, work, state, last=False)
+        extremes.search_trail_for_extremes(problem, work, state, last=False)
 
     monkeypatch.setattr(watching.Extremes, "send_steps", take_here)
     for one, other in ((aside, simulate(mission)), (looked, flown())):
@@ -549,7 +553,7 @@ def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, mon
 
 def test_no_step_is_overwritten_before_it_has_been_watched(monkeypatch):
     """Where the other thread is slow and the flight stops often, to the bit what is found while the flight waits."""
-    mission, take = a_sphere(), watching.Extremes.monitor_steps
+    mission, take = a_sphere(), watching.Extremes.search_trail_for_extremes
     here = threading.get_ident()
 
     def flown() -> list[Any]:
@@ -565,9 +569,9 @@ def test_no_step_is_overwritten_before_it_has_been_watched(monkeypatch):
         take(*given, **options)
 
     def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> None:
-        extremes.monitor_steps(problem, work, state, last=False)
+        extremes.search_trail_for_extremes(problem, work, state, last=False)
 
-    monkeypatch.setattr(watching.Extremes, "monitor_steps", take_slowly)
+    monkeypatch.setattr(watching.Extremes, "search_trail_for_extremes", take_slowly)
     aside = flown()
     monkeypatch.setattr(watching.Extremes, "send_steps", take_here)
     assert aside == flown()
@@ -575,7 +579,7 @@ def test_no_step_is_overwritten_before_it_has_been_watched(monkeypatch):
 
 def test_what_goes_wrong_in_the_thread_that_watches_is_raised(monkeypatch):
     """An error ends the flight; Ctrl-C while it is waited for ends it with what was flown and found."""
-    mission, take = a_sphere(), watching.Extremes.monitor_steps
+    mission, take = a_sphere(), watching.Extremes.search_trail_for_extremes
     here = threading.get_ident()
 
     def fail(*given: Any, **options: Any) -> None:
@@ -584,7 +588,7 @@ def test_what_goes_wrong_in_the_thread_that_watches_is_raised(monkeypatch):
         take(*given, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(watching.Extremes, "monitor_steps", fail)
+        patch.setattr(watching.Extremes, "search_trail_for_extremes", fail)
         with pytest.raises(MemoryError, match="no more of it"):
             simulate(mission)
     done, wait = [], watching.Extremes.wait_for_steps

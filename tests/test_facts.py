@@ -256,7 +256,7 @@ def test_words_on_a_graph_are_those_of_json(name):
     table = next(
         x for x in ahead.facts().shown_parts if isinstance(x, FactTable) and x.heads[0] == "graph"
     )
-    names = [column for column, *_ in table.columns]
+    names = [column for column, *_ in table.names_units_words]
     rows = {row[0]: dict(zip(names, row, strict=True)) for row in table.cell_texts}
     for form, judged in data.items():
         r, row = judged["rigidity"], rows.get(form, {})
@@ -282,7 +282,7 @@ def numbers_shown(ahead: Any) -> dict[tuple[str, str], list[str]]:
         if isinstance(table, FactTable) and not table.bare and table.heads[0] != "planned":
             graph = table.heads[0] == "graph"  # of whose words there is a test
             for row, *cells in table.cell_texts:
-                rest = zip(cells, table.columns[1:], strict=True)
+                rest = zip(cells, table.names_units_words[1:], strict=True)
                 text = " ".join(cell for cell, (*_, words) in rest if not (graph and words))
                 numbers = re.findall(r"(?<![\w.])[-\d.][\d.e+-]*", text)
                 shown[table.heads[0], row] = numbers
@@ -391,11 +391,14 @@ def test_what_applies_to_no_row_is_not_shown():
         ["speed", "3 m/s"],
         ["height", "12345 m"],
     ]
-    assert [name for name, *_ in table_of_worst_values("what", facts).columns] == ["what", "worst"]
+    assert [name for name, *_ in table_of_worst_values("what", facts).names_units_words] == [
+        "what",
+        "worst",
+    ]
     measured = table_of_worst_values(
         "what", [*facts, Fact("tilt", 9.0, "deg", interval=(8.5, 9.25))]
     )
-    assert [name for name, *_ in measured.columns] == ["what", "worst", "true value"]
+    assert [name for name, *_ in measured.names_units_words] == ["what", "worst", "true value"]
     assert measured.cell_texts[2] == ["tilt", "9 deg", "8.5 to 9.25"]
     judged = table_of_worst_values("what", [*facts, Fact("tilt", 9.0, "deg", 5.0, level="fails")])
     assert judged.cell_texts[-1] == ["tilt", "9 deg", "<= 5 deg", "FAILED"]

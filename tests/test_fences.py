@@ -255,7 +255,7 @@ def test_flights_are_judged_between_samples(flown):
         result = rf.trajectories(t[::50], r, velocity=v, mission=result.mission)
     own = boundaries.Boundaries(dense.mission)
     for name, close in (("fence", 2e-3), ("soft_fence", 2e-3), ("people", 2e-2)):
-        values = own.values(name, *states(dense))[0]
+        values = own.worst_by_area(name, *states(dense))[0]
         worst = values.min() if name == "people" else values.max()
         check = rf.assess(result).by_name[name]
         assert check.worst == pytest.approx(worst, abs=close)

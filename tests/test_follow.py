@@ -11,7 +11,7 @@ from rigidfleet.foreign.curves import curve_to_rows, least_jerk_curve
 from rigidfleet.kernel.problem import SHAPE, Reference
 from rigidfleet.kernel.references import blend_slots
 from rigidfleet.math.piecewise import Piecewise, stack_ways
-from rigidfleet.planning.derivatives import way_taylor
+from rigidfleet.planning.derivatives import slot_way_taylor
 
 SLOTS = [[2.0, 0.0, 0.0], [-1.0, 1.7, 0.0], [-1.0, -1.7, 0.0]]
 HEAD = """schema_version = 1
@@ -90,7 +90,7 @@ def test_the_kernel_and_the_plan_evaluate_the_same_ways():
                 for m in range(3):
                     want = told.deriv(m)(inside - knots[k]) if t == inside or not m else 0.0
                     np.testing.assert_allclose(p[m, i, q], want, rtol=1e-12)
-        found = way_taylor(ref, np.array([t]))[..., 0]
+        found = slot_way_taylor(ref, np.array([t]))[..., 0]
         np.testing.assert_allclose(found[:3], p / np.array([1, 1, 2])[:, None, None], rtol=1e-12)
 
 

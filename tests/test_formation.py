@@ -315,7 +315,9 @@ def test_edges_may_be_written_either_way():
 def test_slots_come_back_from_distances(shape, size, n):
     """A complete set of distances gives the shape back, in its own handedness."""
     want, edges = shapes.slots(shape, size, n), graphs.complete_graph(n)
-    got = distance_geometry.slots_from_distances(n, edges, distance_geometry.distances(want, edges))
+    got = distance_geometry.slots_of_all_distances(
+        n, edges, distance_geometry.distances(want, edges)
+    )
     assert got is not None
     np.testing.assert_allclose(got.mean(axis=0), 0, atol=1e-12)
     R = rigid_body.kabsch(want, got)
@@ -326,7 +328,9 @@ def test_slots_come_back_from_distances(shape, size, n):
 def test_slots_from_distances_lie_as_the_named_shapes(shape, n):
     """Table 1 gives distances alone: its triangle and line come out where the paper puts them."""
     want, edges = shapes.slots(shape, 4.0, n), graphs.complete_graph(n)
-    got = distance_geometry.slots_from_distances(n, edges, distance_geometry.distances(want, edges))
+    got = distance_geometry.slots_of_all_distances(
+        n, edges, distance_geometry.distances(want, edges)
+    )
     assert got is not None
     np.testing.assert_allclose(got, want, atol=1e-12)
 
@@ -334,13 +338,13 @@ def test_slots_from_distances_lie_as_the_named_shapes(shape, n):
 def test_incomplete_distances_give_no_slots():
     """One missing distance leaves the shape open."""
     edges = graphs.complete_graph(4)[:-1]
-    assert distance_geometry.slots_from_distances(4, edges, np.ones(5)) is None
+    assert distance_geometry.slots_of_all_distances(4, edges, np.ones(5)) is None
 
 
 def test_distances_of_four_dimensions_are_refused():
     """Five agents that are all 1 m apart need a fourth dimension."""
     with pytest.raises(ValueError, match="no points in space"):
-        distance_geometry.slots_from_distances(5, graphs.complete_graph(5), np.ones(10))
+        distance_geometry.slots_of_all_distances(5, graphs.complete_graph(5), np.ones(10))
 
 
 # -- Kabsch

@@ -929,7 +929,7 @@ def test_sweeps_push_all_and_then_those_that_push_until_little_changes(ask):
     sweep = as_python(
         barriers,
         "difference_along",
-        "push_apart",
+        "apply_force",
         "edge_compliance",
         "enforce_barrier",
         "update_edge_pulls",
@@ -968,7 +968,7 @@ def test_a_barrier_that_asks_for_more_pushes_as_much_as_it_may(most):
         rows=np.array([[0, 1]]), normals=n, shift=np.zeros((2, 3)), missing=np.array([99.0]), push=np.zeros(1),
         reduced=np.array([2.0 / 3.0]), most=np.array([most]), inverse=np.array([1.0, 0.5]),
     )  # fmt: skip
-    enforce = as_python(barriers, "difference_along", "push_apart", "enforce_barrier")
+    enforce = as_python(barriers, "difference_along", "apply_force", "enforce_barrier")
     for change in (1.5 * most, 0.0):
         assert enforce(0, a) == pytest.approx(change)
         assert a.push == pytest.approx([most])

@@ -11,7 +11,7 @@ from rigidfleet.kernel.compiler.simd import (
     fill_lanes,
     pack_lanes,
     rough_inverse,
-    sum_lanes_or_worst,
+    sum_lanes_or_worst_flight,
     unpack_lanes,
 )
 
@@ -89,7 +89,7 @@ def test_an_error_is_a_sum_of_one_flight_and_the_worst_of_eight():
         squares = fill_lanes(0.0)
         for k in range(y.shape[0]):
             squares += y[k] * y[k]
-        return sum_lanes_or_worst(squares, x)
+        return sum_lanes_or_worst_flight(squares, x)
 
     assert error(VALUES.ravel()) == pytest.approx((VALUES**2).sum(), rel=1e-14)
     assert error(pack_lanes(VALUES)) == pytest.approx((VALUES**2).sum(axis=0).max(), rel=1e-14)

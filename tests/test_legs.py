@@ -281,7 +281,12 @@ def test_two_hundred_drawn_missions_follow_the_legs_that_their_checks_plan():
 def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Counts, from now on, of the calls that make what a phase departs from."""
     count: Counter[str] = Counter()
-    places = (legs, "depart"), (legs, "_attach_frame"), (legs, "slot_change"), (timing, "depart")
+    places = (
+        (legs, "depart"),
+        (legs, "_attach_frame"),
+        (legs, "shift_and_rotvec"),
+        (timing, "depart"),
+    )
     for module, name in places:
         function = getattr(module, name)
 
@@ -314,13 +319,13 @@ def test_a_phase_departs_once(monkeypatch):
     draw = Draw(0)
     draw.smooth, draw.phases = True, ONCE
     written = draw.mission(lossless=True)
-    once = {"depart": 6, "_attach_frame": 6, "slot_change": 3}
+    once = {"depart": 6, "_attach_frame": 6, "shift_and_rotvec": 3}
     count = calls(monkeypatch)
     mission = complete_times(written)
     assert count == once | {
         "depart": 4,
         "_attach_frame": 4,
-        "slot_change": 2,
+        "shift_and_rotvec": 2,
     }  # up to the last automatic time
     count.clear()
     preview_phases(mission)

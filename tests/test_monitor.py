@@ -320,7 +320,7 @@ def test_no_distance_changes_by_more_than_its_bound(seed, body):
     outcome = Watched(
         r, 0 * r, np.array([[0.0, 0.5]]), radius=0.1, left=left, body=axes, pairs=none, columns=none
     )
-    outcome.watch.bound_distance_changes(outcome.problem, outcome.state)
+    outcome.watch.write_first_step_change_bounds(outcome.problem, outcome.state)
     space, above = outcome.monitor.moves
     x = (sampled(r) @ T.swapaxes(2, 3))[0, :, :4]
     i, j = np.triu_indices(4, 1)
@@ -347,7 +347,7 @@ def test_one_that_moves_alone_changes_its_distances_by_its_way(axis):
     r[0, :, 9 + axis] += KNOTS
     none = np.zeros((0, 2), dtype=np.int64)
     outcome = Watched(r, 0 * r, np.array([[0.0, 0.5]]), radius=0.1, pairs=none, columns=none)
-    outcome.watch.bound_distance_changes(outcome.problem, outcome.state)
+    outcome.watch.write_first_step_change_bounds(outcome.problem, outcome.state)
     assert 0.95 <= outcome.monitor.moves[0] <= 2.0
 
 
@@ -474,7 +474,7 @@ def test_a_parabola_is_searched_at_its_top_and_not_beside_its_middle(top, middle
         SimpleNamespace(edges=np.zeros((1, 2)), solver=0),
     )
     p = SimpleNamespace(vehicles=vehicles, graph=graph_of)
-    excess = getattr(monitor.parabola_excess, "py_func", monitor.parabola_excess)
+    excess = getattr(monitor.parabola_excess_and_time, "py_func", monitor.parabola_excess_and_time)
     more, at = excess(0, worst, a, b, v, start, middle, end, p, SimpleNamespace(worst=np.zeros(21)))
     assert more == pytest.approx((2.0 * highest - b - worst) / worst, abs=1e-6)
     aside = 1e-3 if end - middle > middle - start else -1e-3

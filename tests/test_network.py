@@ -12,7 +12,7 @@ from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import MissionError
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.engine import native, sampled
-from rigidfleet.kernel.mail import LOST, give_edges_to_links
+from rigidfleet.kernel.mail import LOST, write_edges_of_links
 from rigidfleet.kernel.problem import ITERATED, workspace
 from rigidfleet.kernel.records import FINISHED
 from rigidfleet.planning.legs import leg_of
@@ -70,7 +70,7 @@ def laid_out(m: rf.Mission, r: Floats | None = None, *, h: float | None = None) 
     state = fleet.initial_state(
         flight, S, work, iterations=law.iterations if law.solver == ITERATED else 1
     )
-    give_edges_to_links(flight.network, state.mail, plan.edges, state.integral)
+    write_edges_of_links(flight.network, state.mail, plan.edges, state.integral)
     return plan.problem, work, flight, state
 
 

@@ -115,7 +115,7 @@ def test_the_linear_flight_is_the_flight(tables, loss, changes):
         k, due = state.count[fleet.TICKS], state.mail.due
         arriving, grip = due[:, k % due.shape[1]] == k - delay, state.mail.grip[:, None]
         least_grip = min(least_grip, grip.min())
-        _, x = linear.fly(
+        _, x = linear.squares_and_end(
             x, sent, 1, delay, lambda _, news, now=arriving: now[:, None] * news(0), grip
         )
         sent = np.roll(sent, -1, axis=0)
@@ -194,7 +194,7 @@ def test_the_greatest_growth_is_that_of_the_whole_map(seed, delay):
     whole = linear.size + int(np.prod(shape))
     sent = np.eye(whole)[linear.size :].reshape(*shape, whole).copy()
     start = np.eye(whole)[: linear.size]
-    _, x = linear.fly(start, sent, 1, delay, lambda k, news: news(0))
+    _, x = linear.squares_and_end(start, sent, 1, delay, lambda k, news: news(0))
     tick = np.concatenate([x, np.roll(sent, -1, axis=0).reshape(-1, whole)])
     radius = np.abs(np.linalg.eigvals(tick)).max()
     assert growth_rate_at_delay(linear, delay) == pytest.approx(
@@ -246,7 +246,7 @@ def exact_growth(linear: LinearFlight, delay: int, loss: float, ticks: int) -> f
     def columns(keep: Any) -> Floats:
         sent = np.eye(whole)[size:].reshape(*shape, whole).copy()
         x = np.eye(whole)[:size].copy()
-        _, x = linear.fly(x, sent, 1, delay, keep)
+        _, x = linear.squares_and_end(x, sent, 1, delay, keep)
         return np.concatenate([x, np.roll(sent, -1, axis=0).reshape(-1, whole)])
 
     L, q = linear.shape[1], 1.0 - loss

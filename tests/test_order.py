@@ -13,8 +13,8 @@ import rigidfleet as rf
 from rigidfleet.planning.body_layer import (
     Detour,
     least_norm_feasible,
+    motion_and_growth_rows,
     nearest_accelerations,
-    rigid_motion_rows,
 )
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock
@@ -98,7 +98,7 @@ def test_the_clock_follows_three_lags_and_never_runs_backwards_or_faster(steps):
         assert (rate >= -1e-9).all()
         assert (rate <= 1.0 + 1e-9).all()
         assert (abs(slope) <= STEEPEST * k + 1e-9).all()
-        clock.advance(duration)
+        clock.advance_and_count_delay(duration)
         state, elapsed = found.y[:, -1], elapsed + duration
         assert elapsed - clock.delay == pytest.approx(state[0], abs=1e-7)
         assert clock.rate == pytest.approx(state[1:], abs=1e-6)
@@ -131,7 +131,7 @@ def test_a_path_at_the_clock_s_time_obeys_the_chain_rule(phase):
     """What is flown is r(tau(t)): its velocity and acceleration are the differences of its places, to rounding."""
     clock = VirtualClock()
     clock.set_aim(0.0, 2.0)
-    clock.advance(0.9)
+    clock.advance_and_count_delay(0.9)
     leader = led(phase, Detour(), clock)
     h = 0.1
     problem = leader._detour_problem(5.0, h, np.zeros(7))
@@ -165,7 +165,7 @@ def test_the_body_is_steered_as_an_independent_solver_would(seed):
     masses, arms, scale = rng.uniform(0.5, 2.0, n), rng.normal(size=(n, 3)), rng.uniform(0.7, 1.3)
     normals = rng.normal(size=(6, 3)) + [2.0, 0.0, 0.0]  # so that there is a solution
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    rows = rigid_motion_rows(normals, arms[rng.integers(n, size=6)], scale)
+    rows = motion_and_growth_rows(normals, arms[rng.integers(n, size=6)], scale)
     asked, needed = rng.normal(size=7), rng.normal(size=6) + 1.0
     found = nearest_accelerations(asked, rows, needed, masses, arms, scale)
     assert found is not None

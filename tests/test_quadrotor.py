@@ -383,19 +383,19 @@ def test_tilt_limit():
     limit = math.radians(30)
     F = np.array([1.0, -2.0, 9.0])
     kept = F.copy()
-    assert not attitude_control.limit_tilt(kept, limit, 10.0)
+    assert not attitude_control.limit_tilt_in_place(kept, limit, 10.0)
     assert kept.tolist() == F.tolist()
     F = np.array([6.0, -8.0, 9.0])
     cut = F.copy()
-    assert attitude_control.limit_tilt(cut, limit, 10.0)
+    assert attitude_control.limit_tilt_in_place(cut, limit, 10.0)
     assert cut[2] == 9.0
     assert math.hypot(*cut[:2]) == pytest.approx(9.0 * math.tan(limit))
     assert cut[0] / cut[1] == pytest.approx(F[0] / F[1])
     down = np.array([3.0, 0.0, -4.0])
-    assert attitude_control.limit_tilt(down, limit, 10.0)
+    assert attitude_control.limit_tilt_in_place(down, limit, 10.0)
     assert down[2] == pytest.approx(0.5)
     free = np.array([3.0, 0.0, -4.0])
-    assert not attitude_control.limit_tilt(free, math.pi, 10.0)
+    assert not attitude_control.limit_tilt_in_place(free, math.pi, 10.0)
     assert free.tolist() == [3.0, 0.0, -4.0]
 
 

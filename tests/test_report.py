@@ -207,7 +207,7 @@ def test_words_for_nothing_may_wrap():
     table = page["safety"]
     (row,) = (cells for cells in table.cell_texts if cells[0].startswith("separation below"))
     (column,) = (k for k, cell in enumerate(row) if cell == "no agent flies below another")
-    assert table.columns[column][2]
+    assert table.names_units_words[column][2]
 
 
 def test_legends_of_several_flights_are_whole(calm, hasty):

@@ -276,7 +276,7 @@ def test_each_flight_side_by_side_has_its_own_trail(monkeypatch):
     """The steps of a trail join, and end where its flight is when it flies alone, in wind and noise."""
     missions = varied("windy-passage", windy)
     ends: dict[int, list[np.ndarray]] = {}
-    take = Extremes.monitor_steps
+    take = Extremes.search_trail_for_extremes
 
     def kept(self: Extremes, problem: Any, work: Any, state: Any, *, last: bool) -> None:
         rows = (state.count[FIRST_ROW] + np.arange(state.count[TRAILED])) % len(state.trail.clock)
@@ -288,7 +288,7 @@ def test_each_flight_side_by_side_has_its_own_trail(monkeypatch):
             ends.setdefault(id(self), []).append(here)
         take(self, problem, work, state, last=last)
 
-    monkeypatch.setattr(Extremes, "monitor_steps", kept)
+    monkeypatch.setattr(Extremes, "search_trail_for_extremes", kept)
     simulate_together(missions)
     monkeypatch.undo()
     assert len(ends) == 8

@@ -25,7 +25,7 @@ from rigidfleet.kernel.problem import (
 )
 from rigidfleet.kernel.problem import graph as kernel_graph
 from rigidfleet.math.rigid_body import about_cm
-from rigidfleet.planning.reference import slot_change
+from rigidfleet.planning.reference import shift_and_rotvec
 from rigidfleet.typing import Floats, Ints
 
 
@@ -170,7 +170,7 @@ def shape_schedule(
     m = np.ones(len(p0)) if masses is None else masses
     m, p0 = _check_masses_and_points(m, p0)
     p1 = _broadcast(p1, p0.shape, "p1")
-    dp = slot_change(about_cm(p0, m), about_cm(p1, m), m)[0] if align else p1 - p0
+    dp = shift_and_rotvec(about_cm(p0, m), about_cm(p1, m), m)[0] if align else p1 - p0
     zero = np.zeros(0)
     ref = Reference(SHAPE, float(start), float(blend), zero, zero, p0, dp, np.zeros(3))
     return _distances_at(ref, _check_edges(edges, len(p0)), times)

@@ -99,7 +99,7 @@ class FactTable:
     bare: bool = False
 
     @property
-    def columns(self) -> list[tuple[str, str, bool]]:
+    def names_units_words(self) -> list[tuple[str, str, bool]]:
         """Name and unit of each column that is shown, and whether it holds words; the last one is of marks, if any."""
         names = [self.heads[k].partition(" [") for k in self._shown_column_indices]
         words = [k == 0 or name in self.words for k, (name, *_) in enumerate(names)]
@@ -136,7 +136,7 @@ class FactTable:
             names = f"{'words' * words} {level}".strip()
             return _LOOK if not kind else f' class="{names}"' if names else ""
 
-        columns = self.columns
+        columns = self.names_units_words
         heads = "".join(
             f"<th{cell_attribute(words)}>{html.escape(f'{name} [{unit}]' if unit else name)}</th>"
             for name, unit, words in columns
@@ -155,7 +155,7 @@ class FactTable:
         from rich.table import Table as Grid
         from rich.text import Text
 
-        columns, space = self.columns, 2 if len(self.columns) < _MANY else 1
+        space = 2 if len(columns := self.names_units_words) < _MANY else 1
         below = "\n" if sum(bool(unit) for _, unit, _ in columns) > 1 else " "
         heads = [f"{x}{below}{f'[{unit}]' * bool(unit)}".rstrip(" ") for x, unit, _ in columns]
         widths = self._column_widths(heads, options.max_width - space * (len(columns) - 1))
@@ -186,7 +186,7 @@ class FactTable:
         lines = [[x for row in rows for x in row[k].split("\n")] for k in range(len(heads))]
         widths = [max(map(cell_len, column), default=0) for column in lines]
         least = []
-        for column, width, (*_, words) in zip(lines, widths, self.columns, strict=True):
+        for column, width, (*_, words) in zip(lines, widths, self.names_units_words, strict=True):
             # An indentation belongs to the first word.
             parts = (cell_len(x) for s in column for x in re.findall(r"^ *\S+|\S+", s))
             least.append(max(parts, default=0) if words else width)

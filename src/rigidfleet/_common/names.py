@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
+Dimension = str  # time, length, angle or quotients of them
 #: Units by dimension and factor to s, m and rad.
 _UNITS = {
     "time": {1.0: "s sec secs second", 1e-3: "ms msec millis millisecond", 1e-6: "us usec microsecond",
@@ -91,7 +92,7 @@ class ColumnMeaning(NamedTuple):
         return "length" if self.kind in (*DIRECTIONS, "height") else special.get(self.kind, "")
 
 
-def unit_of(text: str) -> tuple[str, float] | None:
+def unit_of(text: str) -> tuple[Dimension, float] | None:
     """Dimension of a unit, and its factor to s, m and rad; None if it is unknown."""
     plain = text.strip().lower().replace("µ", "u").replace("μ", "u").replace("°", "deg")
     known = _UNIT.get(plain) or (_UNIT.get(plain.rstrip("s")) if len(plain) > 3 else None)

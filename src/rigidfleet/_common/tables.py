@@ -168,11 +168,11 @@ class TextTable:
             raise fault(f"has columns {', '.join(ways)}, but the axes are {axes}", "Remove one")
         return self.find_columns(*ways, who=who), named
 
-    def missing_columns_error(self, *kinds: str) -> ContentError:
+    def missing_columns_error(self, *required_kinds: str) -> ContentError:
         """The error of a table without some quantities."""
         if self.find_columns("latitude"):
             return fault("has latitude and longitude", "Give metres from an origin: x_m, y_m, z_m")
-        missing = ", ".join(kind for kind in kinds if not self.find_columns(kind))
+        missing = ", ".join(kind for kind in required_kinds if not self.find_columns(kind))
         why = f"has no column for {missing} among {', '.join(self.names)[:80]}"
         return fault(why, "Name columns x_m, y_m and z_m, and time_s for trajectories")
 

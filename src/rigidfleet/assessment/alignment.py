@@ -81,16 +81,17 @@ def fit_alignment(logs: Logs, plan: Plan, clock_mode: str) -> Alignment:
         logs = [(t - by, x) for (t, x), by in zip(logs, apart, strict=True)]
     start[0] = _best_clock_offset(logs, plan) if clock_mode == "offset" else 0.0
     every = np.ones(6, dtype=np.bool_)
-    whole, errors, left = _fit(logs, plan, start, every, _mse_and_setup(logs, plan, start[0])[1])
+    guess = _mse_and_setup(logs, plan, start[0])[1]
+    whole, errors, left = _fit_and_standard_errors(logs, plan, start, every, guess)
     own = np.empty((2, len(logs)))
     for i, (log, way) in enumerate(zip(logs, plan, strict=True)):
-        alone, error, _ = _fit([log], [way], whole, every)
+        alone, error, _ = _fit_and_standard_errors([log], [way], whole, every)
         own[:, i] = np.where(np.isfinite(error[0]), [alone[0], error[0]], np.nan)
     own[0] += apart
     errors[0] = errors[0] if np.ptp(apart) == 0.0 else np.nan  # all have none in common
     whole[0] += apart[0]
     fit = np.where(np.isfinite(errors), [whole, errors], np.nan)
-    return Alignment(fit, own, _fit(logs, plan, start, ~every)[2], left)
+    return Alignment(fit, own, _fit_and_standard_errors(logs, plan, start, ~every)[2], left)
 
 
 def _residual_slopes_and_times(logs: Logs, plan: Plan, q: Floats) -> tuple[Floats, Floats, Floats]:
@@ -110,7 +111,7 @@ def _residual_slopes_and_times(logs: Logs, plan: Plan, q: Floats) -> tuple[Float
     return np.concatenate(off), np.concatenate(slopes), np.concatenate(times)
 
 
-def _fit(
+def _fit_and_standard_errors(
     logs: Logs, plan: Plan, start: Floats, free: Bools, guess: Floats | None = None
 ) -> tuple[Floats, Floats, float]:
     """The ``free`` parameters (6,) that a flight tells, from a guess; their errors; the distance that is left.

@@ -102,7 +102,7 @@ def _completeness_check(result: Result) -> CheckResult:
 
 def _record_consistency_check(measured: Measurements) -> Iterator[CheckResult]:
     """Fail a record that contradicts itself: it has been altered and proves nothing."""
-    contradictions = list(measured.contradictions_and_times())
+    contradictions = list(measured.self_contradictions_and_times())
     if contradictions:
         words, when = contradictions[0]
         more = f", and {len(contradictions) - 1} more like that" if len(contradictions) > 1 else ""
@@ -155,7 +155,7 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
         if not (shaping and p.finished) or p.formation is None:
             continue
         last = measured.parts[i].stop - 1
-        edges, _ = measured.edges_at_end[i]
+        edges, _ = measured.edges_and_errors_at_end[i]
         held = False
         if p.distances is not None:
             form = measured.mission.formations[p.formation]
@@ -308,7 +308,7 @@ def _flying_separation_check(measured: Measurements, q: Quantity) -> Iterator[Ch
         yield limit_check(q, e, limit, words)
 
 
-def _separation_certificate_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _certificate_shortfall_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """How much nearer agents come in each phase than its plan's certificate says."""
     allowed = q.limit_of(measured.mission)
     every = [
@@ -344,7 +344,7 @@ def _clearance_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResu
     """Check the clearance in flight, and separately that of vehicles that stand on an obstacle at start or end."""
     if (least := measured.worst(q.name)) is None:
         return
-    apart = {name: e for name, e in measured.least_clearances().items() if e is not None}
+    apart = {name: e for name, e in measured.least_clearances_by_stage().items() if e is not None}
     e = min([least, *apart.values()], key=lambda e: e.value)
     touch = max(_CONTACT, measured.result.statistics.get("touch", 0.0))  # of a log: its noise
     hit = e.value < -touch
@@ -507,7 +507,7 @@ def _tracking_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
 _CHECKS: dict[str, Callable[[Measurements, Quantity], Iterator[CheckResult]]] = {
     "separation": _separation_check,
     "separation_flying": _flying_separation_check,
-    "separation_as_planned": _separation_certificate_check,
+    "separation_as_planned": _certificate_shortfall_check,
     "clearance": _clearance_checks,
     "lost": _lost_vehicle_checks,
     "geofence": _geofence_check,

@@ -76,7 +76,7 @@ def fits_by_sample(
     if apart[0].size:
         worst = _worst_pair_errors(p, np.array(apart))
     else:
-        worst = map(_worst_error, p, slots, norms(own - of_slots @ (u @ vt).swapaxes(1, 2)))
+        worst = map(_worst_pair, p, slots, norms(own - of_slots @ (u @ vt).swapaxes(1, 2)))
     in_order: list[bool | None] = [None] * len(p)
     if lines := [k for k, order in enumerate(orders) if len(order) > 2]:
         # They follow each other where they extend most.
@@ -126,7 +126,7 @@ def _worst_pair_errors(p: Floats, intended: Floats) -> Iterator[_Worst]:
     return zip(*(x.tolist() for x in columns), strict=True)
 
 
-def _worst_error(p: Floats, slots: Floats, off: Floats) -> _Worst:
+def _worst_pair(p: Floats, slots: Floats, off: Floats) -> _Worst:
     """Worst error of a distance of many agents p (N, 3), among all pairs.
 
     Few pairs have to be computed: the error of a pair is at most the sum of both agents' distances ``off`` (N,) from
@@ -161,7 +161,7 @@ def is_rigid(p: Floats, edges: Ints) -> bool:
     return bool(np.isfinite(J).all()) and np.linalg.matrix_rank(J, rtol=1e-6) == 3 * len(p) - 6
 
 
-def degrees_between(a: Sequence[float], b: Sequence[float]) -> float:
+def degrees_between_vectors(a: Sequence[float], b: Sequence[float]) -> float:
     """Angle [deg] between two vectors."""
     (x, y, z), (u, v, w) = a, b
     across = math.hypot(y * w - z * v, z * u - x * w, x * v - y * u)

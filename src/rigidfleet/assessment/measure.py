@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, Quantity, quantity
-from rigidfleet.assessment.fits import Fit, degrees_between, fits_by_sample, formation_shape
+from rigidfleet.assessment.fits import Fit, degrees_between_vectors, fits_by_sample, formation_shape
 from rigidfleet.assessment.verdict import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -167,7 +167,7 @@ class Measurements:
         k = int(np.argmax(sampled.values <= 0.0))
         return self.worst_sample(sampled, slice(k, k + 1), alone=True) or e
 
-    def least_clearances(self) -> dict[str, Extreme | None]:
+    def least_clearances_by_stage(self) -> dict[str, Extreme | None]:
         """Least clearance to obstacles [m] in flight, and of vehicles standing on one at the start or end.
 
         A vehicle stands on an obstacle below it while it has been within `PAD` of it since the start, or stays so to
@@ -192,8 +192,8 @@ class Measurements:
             "clearance_end": (k >= first) & (k > last) & ~beside,
         }
 
-        def agent_and_obstacle(k: int, i: int) -> tuple[int, int]:
-            return i, int(nearest[k, i])
+        def agent_and_obstacle(sample: int, agent: int) -> tuple[int, int]:
+            return agent, int(nearest[sample, agent])
 
         return {
             name: self.worst_among(
@@ -210,7 +210,7 @@ class Measurements:
         radius, time = self.mission.fleet.radius[i], self.result.time[k]
         return near, proximity.below(r, radius, things, time, PAD)
 
-    def contradictions_and_times(self) -> Iterator[tuple[str, float]]:
+    def self_contradictions_and_times(self) -> Iterator[tuple[str, float]]:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
         r = result.position
@@ -272,13 +272,13 @@ class Measurements:
         result, off = self.result, _greatest_sizes(self.result.constraint[self.last])
         constraint_errors = dict(zip(self.flown, off, strict=True))
         for index, record in enumerate(result.phases):
-            fit, waypoints = self.fits_at_end.get(index), self.waypoint_misses.get(index, {})
+            fit, waypoints = self.fits_at_end.get(index), self.misses_by_waypoint.get(index, {})
             finished = index in self.flown and (result.complete or index < len(result.phases) - 1)
             yield PhaseVerdict(
                 *_OF_RECORD(record),
                 finished=finished and not record.abandoned,
                 constraint=constraint_errors.get(index),
-                distances=self.edges_at_end.get(index, (None, None))[1],
+                distances=self.edges_and_errors_at_end.get(index, (None, None))[1],
                 shape=None if fit is None else fit.error,
                 handedness=None if fit is None or fit.dimension < 3 else not fit.is_mirrored,
                 flip=self.axis_errors_at_end.get(index),
@@ -302,7 +302,7 @@ class Measurements:
         return [(str(key[0]), *phases) for key, phases in alike.items()]
 
     @cached_property
-    def edges_at_end(self) -> dict[int, tuple[Ints, float | None]]:
+    def edges_and_errors_at_end(self) -> dict[int, tuple[Ints, float | None]]:
         """Edges (m, 2) that are not lost at the end of each phase with a formation, and the greatest error [m]."""
         mission, ends = self.mission, {}
         for name, indices, last in self._ends_alike:
@@ -350,7 +350,7 @@ class Measurements:
         for (index, fit), aim in zip(flat.items(), aims, strict=True):
             # Only tracked slots steer a line; otherwise its direction follows from the shape before.
             steers = 2 if fit.dimension == 2 else result.phases[index].control == "tracking"
-            angles = (degrees_between(fit.turned_axis, x) for x in aim[:steers])
+            angles = (degrees_between_vectors(fit.turned_axis, x) for x in aim[:steers])
             flips[index] = next(filter(math.isfinite, angles), None)
         return flips
 
@@ -364,7 +364,7 @@ class Measurements:
         return after if abs(time[after] - t) < abs(time[before] - t) else before
 
     @cached_property
-    def waypoint_misses(self) -> dict[int, dict[str, Waypoint]]:
+    def misses_by_waypoint(self) -> dict[int, dict[str, Waypoint]]:
         """Misses of the "target" of each phase, of its place to "stay", and of the points to pass on the way.
 
         A target is due at its time, or at the end of a phase that settles earlier; of the others, those that the

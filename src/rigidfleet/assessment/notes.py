@@ -9,7 +9,7 @@ import numpy as np
 from rigidfleet._common.text import agent_names, first_few
 from rigidfleet.assessment.avoidance import avoidance_notes, clock_notes
 from rigidfleet.assessment.checks import abandonment_check
-from rigidfleet.assessment.fits import degrees_between
+from rigidfleet.assessment.fits import degrees_between_vectors
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import DIP, FLIPPED, PhaseVerdict, value
 from rigidfleet.result.quantities import Samples
@@ -27,7 +27,7 @@ def verdict_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
     yield from _abandoned_phase_notes(measured)
     yield from _negative_height_notes(measured)
     yield from _formation_flip_notes(measured, phases)
-    yield from _fall_notes(measured)
+    yield from _lost_vehicle_fall_notes(measured)
     pairs, times = measured.mission.links_lost
     for (i, j), t in zip(pairs + 1, times, strict=True):
         if t < measured.result.time[-1]:
@@ -126,7 +126,7 @@ def _samples_alone_note(measured: Measurements) -> Iterator[str]:
         )
 
 
-def _fall_notes(measured: Measurements) -> Iterator[str]:
+def _lost_vehicle_fall_notes(measured: Measurements) -> Iterator[str]:
     """Note where each lost vehicle falls."""
     radius = measured.mission.agents.radius
     for i in np.flatnonzero(~measured.left[-1] & (measured.mission.lost_at < np.inf)):
@@ -165,7 +165,7 @@ def _formation_flip_notes(measured: Measurements, phases: list[PhaseVerdict]) ->
         if not p.finished or fit.error > fit.limit:
             continue
         normal, since = seen.setdefault(p.formation, (fit.turned_axis, p.t_end))
-        if degrees_between(normal, fit.turned_axis) > FLIPPED:
+        if degrees_between_vectors(normal, fit.turned_axis) > FLIPPED:
             yield (
                 f"'{p.formation}' turns over between {since:.2f} s and {p.t_end:.2f} s;"
                 " no attitude is commanded"

@@ -183,7 +183,7 @@ def assess(
         from rigidfleet.cli.report import write_report
         from rigidfleet.cli.run import DRAWN, write_figures, write_replay
 
-        made.save(result, verdict)
+        made.save_result_and_verdict(result, verdict)
         write_report([result], [verdict], made.report, quiet=json)
         write_replay(result, made.replay)
         write_figures(result, made.list_figure_paths(figures, DRAWN), quiet=json)

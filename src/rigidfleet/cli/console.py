@@ -187,7 +187,7 @@ class CheckWatch:
 
     def __enter__(self) -> Self:
         self.done = threading.Event()
-        self.thread = threading.Thread(target=self._announce_step, daemon=True)
+        self.thread = threading.Thread(target=self._announce_steps_until_done, daemon=True)
         self.thread.start()
         return self
 
@@ -199,7 +199,7 @@ class CheckWatch:
         """Set the current step."""
         self.stage = stage
 
-    def _announce_step(self) -> None:
+    def _announce_steps_until_done(self) -> None:
         while not self.done.wait(_PATIENCE):
             text = f"Checking {self.what}: {self.stage}, {perf_counter() - self.begun:.0f} s"
             err().print(text, soft_wrap=True)

@@ -52,7 +52,7 @@ def live(
 
     def save_flight(result: Result) -> str:
         files = Files(place.folder, result.mission.name).make_unique_folder()
-        console.show_verdict(files.save(result))
+        console.show_verdict(files.save_result_and_verdict(result))
         files.print_paths()
         return f"Saved in {files.result}."
 

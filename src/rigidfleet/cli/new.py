@@ -84,7 +84,7 @@ def new(
     }  # fmt: skip
     options = {key: value for key, value in all_options.items() if value is not None}
     if not (options or quiet or json or show) and sys.stdin.isatty() and console.err().is_terminal:
-        name, options = _ask_for_mission(name)
+        name, options = _ask_for_name_and_answers(name)
     file = with_toml_suffix(Path(name or "mission"))
     refuse_overwriting(file, force=force, other="give another name")
     if not show and (formations or shape or "cube") not in SHAPES:  # points make a show
@@ -183,7 +183,7 @@ def _points_of_file(word: str) -> Any:
 _SHOWN = 100
 
 
-def _ask_for_mission(name: str) -> tuple[str, dict[str, Any]]:
+def _ask_for_name_and_answers(name: str) -> tuple[str, dict[str, Any]]:
     """Ask for the name and the numbers of a new mission, one by one. An empty answer accepts the default."""
     from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
     from rigidfleet.mission import draft

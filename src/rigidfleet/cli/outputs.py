@@ -100,7 +100,7 @@ class Files:
         except OSError as error:
             raise unwritable_error(folder, error) from error
 
-    def save(self, result: Result, verdict: Verdict | None = None) -> Verdict:
+    def save_result_and_verdict(self, result: Result, verdict: Verdict | None = None) -> Verdict:
         """Write a result and its verdict, without what is left of an earlier result, and return the verdict.
 
         Raises

@@ -99,7 +99,7 @@ def run(
             result, interrupted = simulate(loaded, progress=progress), False
         except FlightInterrupted as stop:
             result, interrupted = stop.result, True
-    verdict = files.save(result)
+    verdict = files.save_result_and_verdict(result)
     if csv:
         try:
             result.to_csv(files.table, rate=csv_rate, flown=flown)
@@ -153,9 +153,9 @@ def missions(
 
         from rigidfleet._common.facts import FactTable, Row
 
-        def row(name: str) -> Row:
-            head = tomllib.loads(mission_text(name))
-            return Row((f"  {name}", head.get("title"), head.get("source")))
+        def row(mission: str) -> Row:
+            head = tomllib.loads(mission_text(mission))
+            return Row((f"  {mission}", head.get("title"), head.get("source")))
 
         rows = [
             x for group, names in GROUPS.items() for x in (Row((group, "", "")), *map(row, names))

@@ -61,7 +61,7 @@ def violations(edges: ArrayLike, lengths: ArrayLike) -> list[Violation]:
     for i, j in pairs:
         after[i].add(j)
     broken: list[Violation] = []
-    for size, excess_of in ((3, _triangle_excess_and_violations), (4, _squared_volumes)):
+    for size, excess_of in ((3, _triangle_excess_and_violations), (4, _squared_volumes_impossible)):
         cliques = list(_cliques(after, size))
         numbers = (index[pair] for agents in cliques for pair in combinations(agents, 2))
         sides = np.fromiter(numbers, np.int64).reshape(-1, size * (size - 1) // 2)
@@ -76,14 +76,14 @@ def violations(edges: ArrayLike, lengths: ArrayLike) -> list[Violation]:
 def _cliques(after: dict[int, set[int]], size: int) -> Iterator[tuple[int, ...]]:
     """Agents i < j < ... of which every pair has an edge."""
 
-    def extend(clique: tuple[int, ...], common: set[int]) -> Iterator[tuple[int, ...]]:
+    def cliques_of_size(clique: tuple[int, ...], common: set[int]) -> Iterator[tuple[int, ...]]:
         if len(clique) == size:
             yield clique
             return
         for i in sorted(common):
-            yield from extend((*clique, i), common & after[i])
+            yield from cliques_of_size((*clique, i), common & after[i])
 
-    return extend((), set(after))
+    return cliques_of_size((), set(after))
 
 
 def _triangle_excess_and_violations(sides: Floats) -> tuple[Floats, Bools]:
@@ -93,7 +93,7 @@ def _triangle_excess_and_violations(sides: Floats) -> tuple[Floats, Bools]:
     return excess, excess > REALISABLE * longest
 
 
-def _squared_volumes(sides: Floats) -> tuple[Floats, Bools]:
+def _squared_volumes_impossible(sides: Floats) -> tuple[Floats, Bools]:
     """Squared volumes of tetrahedra of sides 12, 13, 14, 23, 24, 34 (K, 6) [m], and where they are negative."""
     a, b, c, ab, ac, bc = squares = sides.T**2
     # Gram matrix of the three edges from the first agent, doubled: its determinant is 288 V^2 (Cayley-Menger).
@@ -108,7 +108,7 @@ def gram_eigensystem(d: Floats) -> tuple[Floats, Floats]:
     return np.linalg.eigh(-0.5 * centring @ d**2 @ centring)
 
 
-def slots_from_distances(n: int, edges: ArrayLike, lengths: ArrayLike) -> Floats | None:
+def slots_of_all_distances(n: int, edges: ArrayLike, lengths: ArrayLike) -> Floats | None:
     """Slots (n, 3) [m] of a *complete* set of distances (classical multidimensional scaling).
 
     Distances determine neither attitude nor handedness; both follow a convention that agrees with the paper's
@@ -148,7 +148,7 @@ def slots_from_distances(n: int, edges: ArrayLike, lengths: ArrayLike) -> Floats
 
 
 def _turn_to_slot_convention(p: Floats) -> Floats:
-    """Turn and mirror centred points (N, 3) to the convention of `slots_from_distances`."""
+    """Turn and mirror centred points (N, 3) to the convention of `slots_of_all_distances`."""
     x = _first_nonzero_direction(p[::-1], p)
     if x is None:
         return p

@@ -182,9 +182,9 @@ def _directions_and_distances(p: Floats, some: Ints, at: Ints) -> tuple[Floats, 
     return np.where(there[..., None], x / np.maximum(length, 1e-300)[..., None], 0.0), length
 
 
-def _edges_to_triple(some: Ints, at: Ints, triple: Ints) -> Ints:
-    """Edges (3k, 2) of points (k,) to three (k, 3) of those ``at`` (k, 12)."""
-    return np.column_stack([np.repeat(some, 3), np.take_along_axis(at, triple, 1).ravel()])
+def _edges_to_triple(some: Ints, candidates: Ints, columns: Ints) -> Ints:
+    """Edges (3k, 2) of points (k,) to three (k, 3) of those ``candidates`` (k, 12)."""
+    return np.column_stack([np.repeat(some, 3), np.take_along_axis(candidates, columns, 1).ravel()])
 
 
 def farthest_points(p: Floats, count: int, first: int = 0) -> Ints:

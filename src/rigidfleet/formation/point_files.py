@@ -28,6 +28,8 @@ _TYPES = {
 _AXES, _HUES = ["x", "y", "z"], ["red", "green", "blue"]
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _ENDS: dict[str, Any] = {"<": "little", ">": "big"}
+Colours = tuple[str, ...] | None
+Notes = tuple[str, ...]
 
 
 class Points(NamedTuple):
@@ -150,7 +152,7 @@ def _hex_colours(colours: Floats, *, real: bool) -> tuple[str, ...]:
     return tuple(f"#{row.tobytes().hex()}" for row in colours.astype(np.uint8))
 
 
-def _read_point_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tuple[str, ...]]:
+def _read_point_table(data: bytes) -> tuple[Ints, Floats, Colours, Notes]:
     """Lines (N,), points (N, 3), colours and notes of a table.
 
     Raises
@@ -199,7 +201,7 @@ def _read_point_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None
     return table.lines, points, colours, tuple(notes)
 
 
-def _read_npy(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
+def _read_npy(data: bytes) -> tuple[Floats, Colours, Notes]:
     """Points (N, 3), colours and notes of an NPY file."""
     try:
         array = np.load(io.BytesIO(data), allow_pickle=False)
@@ -216,7 +218,7 @@ def _read_npy(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, .
     return points, _hex_colours(array[:, 3:].astype(np.float64), real=array.dtype.kind == "f"), ()
 
 
-def _read_ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
+def _read_ply(data: bytes) -> tuple[Floats, Colours, Notes]:
     """Points (N, 3), colours and notes: vertices of a PLY file (Turk, The PLY polygon file format, 1994)."""
     head, *body = re.split(rb"end_header(?:\r\n|\n|\r)", data, maxsplit=1)
     lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]

@@ -18,8 +18,8 @@ from rigidfleet.math.rigid_body import centred
 from rigidfleet.typing import Floats
 
 
-def _line(size: Floats, n: int) -> Floats:
-    x = size[0] * np.arange(n)
+def _line(spacing: Floats, n: int) -> Floats:
+    x = spacing[0] * np.arange(n)
     return np.column_stack([x, 0 * x, 0 * x])
 
 
@@ -55,51 +55,51 @@ def _v(size: Floats, n: int) -> Floats:
     return np.column_stack([-step, side * step, 0 * step])
 
 
-def _grid(size: Floats, n: int) -> Floats:
+def _grid(spacing: Floats, n: int) -> Floats:
     row, column = np.divmod(np.arange(n), int(np.ceil(np.sqrt(n))))
-    return size[0] * np.column_stack([column, row, 0 * row])
+    return spacing[0] * np.column_stack([column, row, 0 * row])
 
 
-def _sphere(size: Floats, n: int) -> Floats:
+def _sphere(spacing: Floats, n: int) -> Floats:
     # Fibonacci's spiral: equal areas in height, the golden angle around.
     z = (2 * np.arange(n) + 1) / n - 1
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
     across = np.sqrt(1 - z**2)
     p = np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
-    return p * size[0] / nearest(p).min()
+    return p * spacing[0] / nearest(p).min()
 
 
-def _two_spheres(size: Floats, n: int) -> Floats:
+def _two_spheres(spacing: Floats, n: int) -> Floats:
     """Two concentric spheres, the outer one first; their distance is that of neighbours on each sphere."""
 
     def sphere_radius(count: int) -> float:
-        return float(np.linalg.norm(_sphere(size, count)[0]))
+        return float(np.linalg.norm(_sphere(spacing, count)[0]))
 
-    def shell_distance(outer_count: int) -> float:
+    def gap_between_shells(outer_count: int) -> float:
         return sphere_radius(outer_count) - sphere_radius(n - outer_count)
 
     numbers = range(n // 2 + 1, n - 3)  # of agents of the outer sphere
-    outer = n // 2 + 1 + bisect_left(numbers, size[0], key=shell_distance)
+    outer = n // 2 + 1 + bisect_left(numbers, spacing[0], key=gap_between_shells)
     if outer not in numbers:
         raise ValueError(f"{n} agents are too few for a sphere inside a sphere")
-    return np.concatenate([_sphere(size, outer), _sphere(size, n - outer)])
+    return np.concatenate([_sphere(spacing, outer), _sphere(spacing, n - outer)])
 
 
 def _helix(size: Floats, n: int) -> Floats:
     radius, rise, spacing = size
 
-    def chord(angle: float) -> float:
+    def helix_chord(angle: float) -> float:
         return float(np.hypot(2 * radius * np.sin(angle / 2), rise * angle / (2 * np.pi)))
 
     low, high = 0.0, np.pi
-    if spacing > chord(high):
+    if spacing > helix_chord(high):
         raise ValueError(
             f"a helix of radius {radius:g} m that rises {rise:g} m per turn allows a distance between neighbours of "
-            f"at most {chord(high):.4g} m (half a turn), not {spacing:g}"
+            f"at most {helix_chord(high):.4g} m (half a turn), not {spacing:g}"
         )
     for _ in range(60):
         middle = (low + high) / 2
-        low, high = (middle, high) if chord(middle) < spacing else (low, middle)
+        low, high = (middle, high) if helix_chord(middle) < spacing else (low, middle)
     angle = high * np.arange(n)
     x, y = radius * np.cos(angle), radius * np.sin(angle)
     return np.column_stack([x, y, rise * angle / 2 / np.pi])

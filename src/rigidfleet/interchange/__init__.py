@@ -22,7 +22,7 @@ from rigidfleet._common.files import replace_folder_atomically, write_file
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign import texts
 from rigidfleet.interchange import crazyflie, gltf, mavlink, recordings, skybrush
-from rigidfleet.interchange.curves import Deviation, ExportedMotion, deviation, exported_motion
+from rigidfleet.interchange.curves import Deviation, ExportedMotion, deviation, motion_and_is_cut
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result import Result, as_result
 from rigidfleet.result.lights import has_lights
@@ -71,7 +71,7 @@ def _write_table(motion: ExportedMotion, rate: float | None, first: int = 1) -> 
     yield csv_text(motion.at_rate(rate), first).encode()
 
 
-def _write_vehicle_tables(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
+def _write_table_of_each_vehicle(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     """Such a table for each vehicle."""
     for i in range(motion.n_agents):
         yield from _write_table(motion.of_vehicle(i), rate, i + 1)
@@ -103,7 +103,7 @@ FORMATS: dict[str, Format] = {
         "position, velocity, yaw and yaw rate", "acceleration, jerk, tilt and rotors", False, "mcap", "mcap",
     ),
     "tlog": Format(
-        mavlink.write_tlog, mavlink.read_tlog, "tlog", True, None,
+        mavlink.write_tlog_of_each_vehicle, mavlink.read_tlog, "tlog", True, None,
         "position, velocity, acceleration, yaw and yaw rate", "jerk, tilt and rotors",
     ),
     "rrd": Format(
@@ -199,7 +199,7 @@ def export(
     result, path = as_result(result), as_path(path)
     chosen = format_by_name(format)
     if format == "setpoints" and path.suffix != ".csv":
-        chosen = chosen._replace(write=_write_vehicle_tables, each=True)
+        chosen = chosen._replace(write=_write_table_of_each_vehicle, each=True)
     setting = _rate_or_tolerance(format, chosen, rate, tolerance)
     if chosen.package and find_spec(chosen.package) is None:
         raise ResultError(
@@ -207,7 +207,7 @@ def export(
             f"pip install {chosen.distribution}"
         )
     try:
-        motion, cut = exported_motion(result, flown=flown)
+        motion, cut = motion_and_is_cut(result, flown=flown)
         off, size, count = _write_and_measure(motion, chosen, path, setting)
     except ResultError as error:
         raise ResultError(f"{format}: {error}") from None

@@ -46,7 +46,7 @@ def _refuse_beyond_memory(
     """A writer of images, with an error about one that does not fit: which tolerance, and how many seconds do."""
 
     @wraps(images)
-    def write(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
+    def write_within_memory(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
         for agent, (data, needed, ends) in enumerate(images(motion, tolerance)):
             if len(data) > MEMORY:
                 alone, wider = motion.of_vehicle(agent), [x for x in _TRIED if x > tolerance]
@@ -59,7 +59,7 @@ def _refuse_beyond_memory(
                 )
             yield data
 
-    return write
+    return write_within_memory
 
 
 def write_polynomial(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:

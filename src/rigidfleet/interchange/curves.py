@@ -213,7 +213,7 @@ def deviation(source: Piecewise, written: Piecewise, until: float = np.inf) -> D
     return Deviation(far, float(abs(turned).max(initial=0.0)), missing)
 
 
-def exported_motion(result: Result, *, flown: bool) -> tuple[ExportedMotion, bool]:
+def motion_and_is_cut(result: Result, *, flown: bool) -> tuple[ExportedMotion, bool]:
     """What can be exported of a flight, and whether its beginning or end is left out: no slot is tracked there.
 
     Raises

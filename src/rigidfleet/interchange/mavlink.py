@@ -41,7 +41,7 @@ _MARK, _STATION, _SYSTEMS = 0xFE, 255, 255
 _LOCAL_NED, _AUTOPILOT = 1, 1
 
 
-def write_tlog(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
+def write_tlog_of_each_vehicle(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     """A log for each vehicle: at each time a message that asks for position, velocity, acceleration, yaw and yaw rate.
 
     Vehicle i is system i (from 256 on, again from 1). Times are whole milliseconds since the start; states are those

@@ -19,7 +19,7 @@ _speed = jit_inline(speed_of)
 
 
 @jit
-def limit_tilt(F, tilt, weight):
+def limit_tilt_in_place(F, tilt, weight):
     """Limit the tilt of a desired force F (3,) [N] to ``tilt`` [rad]; none from pi/2 on. Returns whether F changed.
 
     The vertical part is kept, but is at least a twentieth of the ``weight`` [N]; the horizontal one is shortened.
@@ -163,7 +163,7 @@ def write_desired_attitude(k, i, flight, state, F):
     vehicles, tables, work = flight.vehicles, flight.tables, state.work
     m, row = vehicles.m[i], k - tables.first
     yaw, F_dot, F_ddot = work.x[1], work.x[2], work.x[3]
-    limited = limit_tilt(F, vehicles.tilt[i], m * vehicles.g) or state.layers[i] != 0
+    limited = limit_tilt_in_place(F, vehicles.tilt[i], m * vehicles.g) or state.layers[i] != 0
     for q in range(3):
         yaw[q] = tables.yaw[row, i, q] if tables.yaw.shape[0] > 0 else 0.0
         # At the limit of tilt, the force does not follow the reference's jerk

@@ -229,15 +229,15 @@ def for_next_phase(avoidance: AvoidanceArrays) -> AvoidanceArrays:
     return avoidance._replace(**_empty_avoidance_record(len(avoidance.b)))
 
 
-def with_obstacles(avoidance: AvoidanceArrays, solids: Solids) -> AvoidanceArrays:
+def with_obstacles(avoidance: AvoidanceArrays, all_solids: Solids) -> AvoidanceArrays:
     """The same avoidance among other obstacles; the first of them are those before, and what is known of them stays."""
     before = avoidance.sight
-    seen = initial_sight(solids, before.reach, 0.0, before.swerve)
+    seen = initial_sight(all_solids, before.reach, 0.0, before.swerve)
     seen = seen._replace(noise=before.noise, normals=before.normals)
     for mine, old in zip(seen[-4:], before[-4:], strict=True):  # what is known
         mine[: len(old)] = old
     return avoidance._replace(
-        solids=solids, sight=seen, **_barrier_arrays(len(avoidance.b), len(solids.kind))
+        solids=all_solids, sight=seen, **_barrier_arrays(len(avoidance.b), len(all_solids.kind))
     )
 
 

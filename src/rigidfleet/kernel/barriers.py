@@ -24,7 +24,7 @@ makes the problem solvable where barriers contradict each other. Edges let go wh
 
 import math
 
-from rigidfleet.kernel.attitude_control import limit_tilt
+from rigidfleet.kernel.attitude_control import limit_tilt_in_place
 from rigidfleet.kernel.avoidance import BARRIER, EXACT, KNOWN
 from rigidfleet.kernel.avoidance import needed_gap_acceleration as _needed_rate
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
@@ -200,7 +200,7 @@ def difference_along(i, j, n, x):
 
 
 @jit
-def push_apart(i, j, n, force, avoid):
+def apply_force(i, j, n, force, avoid):
     """Add the accelerations of a force [N] along a unit vector n (3,) on i, and against it on j if j is not -1."""
     for q in range(3):
         avoid.shift[i, q] += force * avoid.inverse[i] * n[q]
@@ -226,7 +226,7 @@ def enforce_barrier(k, avoid):
     more = push - avoid.push[k]
     if more == 0.0:
         return 0.0
-    push_apart(i, j, n, more, avoid)
+    apply_force(i, j, n, more, avoid)
     avoid.push[k] = push
     return abs(more) * (avoid.inverse[i] + (avoid.inverse[j] if j >= 0 else 0.0))
 
@@ -243,7 +243,7 @@ def update_edge_pulls(p, w, avoid):
         soft, diagonal = edge_compliance(e, p, avoid), p.graph.diagonal[e]
         pull = -_BEYOND * (along + soft * avoid.pull[e]) / (diagonal + soft)
         change = max(change, abs(pull) * diagonal)
-        push_apart(i, j, n, pull, avoid)
+        apply_force(i, j, n, pull, avoid)
         avoid.pull[e] += pull
     return change
 
@@ -326,7 +326,7 @@ def solve_active_set(count, p, w, avoid):
             return False
     for row in range(whole):
         i, j, n = pair_and_normal_of_row(row, size, p, w, avoid)
-        push_apart(i, j, n, avoid.right[row], avoid)
+        apply_force(i, j, n, avoid.right[row], avoid)
         if row < size:
             avoid.push[avoid.active[row]] += avoid.right[row]
         else:
@@ -353,7 +353,7 @@ def solve_barriers(count, p, w, avoid):
     avoid.pull[:] = 0.0
     for k in range(count):
         if avoid.push[k] > 0.0:
-            push_apart(avoid.rows[k, 0], avoid.rows[k, 1], avoid.normals[k], avoid.push[k], avoid)
+            apply_force(avoid.rows[k, 0], avoid.rows[k, 1], avoid.normals[k], avoid.push[k], avoid)
     for _ in range(3):
         for _ in range(_SWEEPS):
             if sweep_gauss_seidel(count, p, w, avoid) < _CLOSE:
@@ -371,7 +371,7 @@ def limit_thrust(i, avoid):
         c[0], c[1], c[2] = share * c[0], share * c[1], share * (c[2] + avoid.g) - avoid.g
     if avoid.tilt[i] < math.inf:
         c[2] += avoid.g
-        limit_tilt(c, avoid.tilt[i], avoid.g)
+        limit_tilt_in_place(c, avoid.tilt[i], avoid.g)
         c[2] -= avoid.g
 
 

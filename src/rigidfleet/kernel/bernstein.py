@@ -211,7 +211,7 @@ def distance_bound_by_plane(piece, distance, x, y, z):
 
 
 @jit
-def tangent_of_box(x, y, z, b, _, boxes):
+def gap_and_normal(x, y, z, b, _, boxes):
     """Signed distance of a point from box b, negative inside, and the normal of its tangent plane."""
     nx, ny, nz = box_normal(x, y, z, boxes[b])
     return box_distance(x, y, z, boxes[b]), nx, ny, nz
@@ -247,7 +247,7 @@ def start_piece_stack(pieces):
 def distance_to_box(curve, b, part, to_beat, pieces, boxes):
     """Least distance of a curve with control points (5, 3) from box b, if below ``to_beat``, and its place; else -1.
 
-    `obstacles` makes of this source the same for any solid, or a ``part`` of one, by another `tangent_of_box`.
+    `obstacles` makes of this source the same for any solid, or a ``part`` of one, by another `gap_and_normal`.
     """
     for k in range(5):
         for q in range(3):
@@ -255,11 +255,11 @@ def distance_to_box(curve, b, part, to_beat, pieces, boxes):
     best, at, top, count, close = to_beat, -1.0, 0, 0, start_piece_stack(pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
-        distance, x, y, z = tangent_of_box(piece[6], piece[7], piece[8], b, part, boxes)
+        distance, x, y, z = gap_and_normal(piece[6], piece[7], piece[8], b, part, boxes)
         bound = distance_bound_by_plane(piece, distance, x, y, z)
         if bound < best - close:
             for k in (0, 12):
-                distance, _, _, _ = tangent_of_box(
+                distance, _, _, _ = gap_and_normal(
                     piece[k], piece[k + 1], piece[k + 2], b, part, boxes
                 )
                 if distance < best:

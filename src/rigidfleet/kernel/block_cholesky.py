@@ -25,7 +25,7 @@ def elimination_tree(first, left, parent, ancestor):
 
 
 @jit
-def count_factor_blocks(first, left, parent, mark, count, most):
+def add_block_counts(first, left, parent, mark, count, most):
     """Add the blocks below the diagonal to each column's count (N,); return False for more than ``most`` in all."""
     total = 0
     for k in range(parent.shape[0]):
@@ -44,7 +44,7 @@ def count_factor_blocks(first, left, parent, mark, count, most):
 
 @jit
 def list_factor_blocks(first, left, parent, mark, free, out):
-    """Write the rows and columns of the blocks counted by `count_factor_blocks`."""
+    """Write the rows and columns of the blocks counted by `add_block_counts`."""
     at = 0
     for k in range(parent.shape[0]):
         mark[k] = k

@@ -170,7 +170,7 @@ def write_slots_by_own_clock(p, w, state):
 
 
 @jit
-def drop_own_constraint_force(i, w, net, state):
+def zero_own_constraint_force(i, w, net, state):
     """Exert no constraint force as vehicle i; its integrals of constraints go on, as its neighbours' do."""
     mail = state.mail
     state.saturated[i] = True  # its own integral rests; steering says anew whether it is

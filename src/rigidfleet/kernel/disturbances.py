@@ -5,9 +5,9 @@ Before the laws, `swap_in_measured_states` replaces the true state by the measur
 `restore_states_and_disturb` restores the true state and adds the forces that no vehicle knows.
 """
 
-from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- compiles `height_below`
+from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- compiles `top_of_solids_below`
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
-from rigidfleet.solids.distance import height_below
+from rigidfleet.solids.distance import top_of_solids_below
 
 # A lost vehicle on the ground: critically damped contact of this natural frequency [1/s], damped from
 # this depth [m] on. It stops within a metre from 40 m/s, and needs no shorter steps than a flight.
@@ -96,7 +96,7 @@ def restore_states_and_disturb(t, m, g, disturbance, w):
             w.f_E[i, q] += w.f_D[i, q]
         w.f_E[i, 2] -= (true - m[i]) * g
         if disturbance.lost[i]:
-            over = height_below(w.r[i, 0], w.r[i, 1], w.r[i, 2], disturbance.roofs)
+            over = top_of_solids_below(w.r[i, 0], w.r[i, 1], w.r[i, 2], disturbance.roofs)
             floor = max(disturbance.floor[i], over + disturbance.radius[i])
             damping, lift = ground_damping_and_lift(true, g, floor, w.r[i, 2])
             for q in range(3):

@@ -26,7 +26,7 @@ from rigidfleet.kernel.records import (
     TRAILED,
     TRIAL,
 )
-from rigidfleet.kernel.vectors import as_lanes, fill_lanes, rough_inverse, sum_lanes_or_worst
+from rigidfleet.kernel.vectors import as_lanes, fill_lanes, rough_inverse, sum_lanes_or_worst_flight
 
 # Dormand and Prince's 5(4) pair, with Hairer's fourth-order continuous extension.
 _STAGES = 7
@@ -207,7 +207,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
             count[EVALUATIONS] += 1
             stage += 1
         squares = squared_errors(k, h, state.rtol, p)
-        error = math.sqrt(sum_lanes_or_worst(squares, y) / n)
+        error = math.sqrt(sum_lanes_or_worst_flight(squares, y) / n)
         if not error <= 1.0:  # NaN too
             count[REJECTED] += 1
             first = 1

@@ -46,11 +46,11 @@ from rigidfleet.kernel.moving import (
     write_stop_relative_to_obstacle,
 )
 from rigidfleet.kernel.rigid_body import attitude_matrix
-from rigidfleet.kernel.sampled_flight import write_measured_states
+from rigidfleet.kernel.sampled_flight import write_measured_r_and_v
 from rigidfleet.kernel.segments import (
     hull_gap,
+    least_value,
     obstacle_distance,
-    parabola_min,
     refined_obstacle_distance,
     segment_distance,
     segment_obstacle_bounds,
@@ -108,7 +108,7 @@ def write_braking_acceleration(i, v, avoid, out):
 
 
 @jit
-def adopt_candidate(i, far, avoid):
+def commit_trial(i, far, avoid):
     """Make the candidate ``trial`` the present choice of vehicle i."""
     trial = avoid.trial
     avoid.far[i] = far
@@ -150,7 +150,7 @@ def is_apart(i, v_i, j, v_j, floor, avoid):
     theirs = n0 * rise[0] + n1 * rise[1] + n2 * rise[2]
     # Drag lets accelerations decay during the tick
     least = min(own, own * avoid.coast[i, 0]) - max(theirs, theirs * avoid.coast[j, 0])
-    return parabola_min(along, rate, least, avoid.period) >= floor
+    return least_value(along, rate, least, avoid.period) >= floor
 
 
 @jit
@@ -178,7 +178,7 @@ def clears_static_obstacles(i, v, far, avoid):
             rate += normal[q] * v[q]
             rise += normal[q] * way[4, q]
         rise = min(rise, rise * avoid.coast[i, 0])
-        if parabola_min(value - x * along, rate, rise, avoid.period) < floor:
+        if least_value(value - x * along, rate, rise, avoid.period) < floor:
             return False
     return True
 
@@ -269,7 +269,7 @@ def greatest_row_norm(x):
 
 
 @jit
-def greatest_move_since_listing(r, avoid):
+def greatest_move_beside_mean(r, avoid):
     """Greatest way [m] of a vehicle since neighbours were listed, beside the way that all have gone."""
     # What all have gone together changes no distance: a fleet that travels keeps its lists.
     n, farthest = avoid.b.shape[0], 0.0
@@ -293,7 +293,7 @@ def update_neighbours(r, v, lost, avoid):
     due = avoid.count[LISTED] == 0 or fastest > avoid.span[1] or hardest > avoid.span[2]
     # Nor for speeds far below those for which it was made
     due = due or 2.5 * fastest + _LEAST_SPEED < 0.8 * avoid.span[1]
-    if not (due or 2.0 * greatest_move_since_listing(r, avoid) > avoid.span[0]):
+    if not (due or 2.0 * greatest_move_beside_mean(r, avoid) > avoid.span[0]):
         return True
     speed, hard = (1.0 + _FASTER) * fastest + _LEAST_SPEED, (1.0 + _FASTER) * hardest + 1.0
     way = interaction_range(speed, hard, avoid)
@@ -318,19 +318,19 @@ def note_margin(kind, value, t, i, j, avoid):
 
 
 @jit
-def is_alone(i, avoid):
+def has_nothing_to_avoid(i, avoid):
     """Whether vehicle i has neither neighbours nor obstacles."""
     return avoid.start[i + 1] == avoid.start[i] and avoid.solids.kind.shape[0] == 0
 
 
 @jit
-def set_obstacle_distance_to_keep(t, i, o, r, v, closest, avoid):
+def set_obstacle_distance_to_keep(t, i, o, r, v, least_excess, avoid):
     """Find the distance that the relative stop segment of vehicle i keeps from obstacle o, which moves.
 
     Returns the least by which such a segment exceeds what it needs so far, at most 0; `threat` is its obstacle.
     """
     if not is_obstacle_known(o, avoid):
-        return closest
+        return least_excess
     stop, speed = write_stop_relative_to_obstacle(i, o, r, v, avoid)
     way, bound, braking = avoid.shifted, avoid.sight.bound[o], relative_braking_limit(i, o, avoid)
     need = avoid.reach[i] + avoid.spare[i] + bound[0] + bound[1] * speed / braking
@@ -344,17 +344,17 @@ def set_obstacle_distance_to_keep(t, i, o, r, v, closest, avoid):
         kept = refined_obstacle_distance(way[0], way[2], o, avoid.solids, enough, avoid.normal)
         avoid.walls[i, o] = min(need, kept)
         note_margin(OBSTACLE, kept - avoid.reach[i], t, i, o, avoid)
-        if kept - need < closest or (apart < need and closest == 0.0):
-            avoid.threat[i], closest = o, min(kept - need, 0.0)
-    return closest
+        if kept - need < least_excess or (apart < need and least_excess == 0.0):
+            avoid.threat[i], least_excess = o, min(kept - need, 0.0)
+    return least_excess
 
 
 @jit
-def brake_and_set_distances(t, r, v, lost, avoid):
+def brake_and_set_gaps_to_keep(t, r, v, lost, avoid):
     """Let all vehicles brake, and find the distances that their stop segments keep, as they should or as they do."""
     n, c, normal, solids = avoid.b.shape[0], avoid.trial[3], avoid.normal, avoid.solids
     for i in range(n):
-        if is_alone(i, avoid):
+        if has_nothing_to_avoid(i, avoid):
             continue
         write_braking_acceleration(i, v[i], avoid, c)
         speed = math.sqrt(v[i, 0] ** 2 + v[i, 1] ** 2 + v[i, 2] ** 2)
@@ -362,7 +362,7 @@ def brake_and_set_distances(t, r, v, lost, avoid):
         for q in range(3):
             avoid.ways[i, 3, q] = r[i, q] + stop / max(speed, 1e-12) * v[i, q]
         # It stays on the stop segment, also after the tick
-        adopt_candidate(i, max(predict_motion(i, r[i], v[i], c, avoid, avoid.trial), stop), avoid)
+        commit_trial(i, max(predict_motion(i, r[i], v[i], c, avoid, avoid.trial), stop), avoid)
     # A vehicle that is nearer than it should be keeps what it has: a floor that nobody meets would stop all.
     for i in range(n):
         if lost[i]:
@@ -399,7 +399,7 @@ def brake_and_set_distances(t, r, v, lost, avoid):
 
 
 @jit
-def is_safe(i, r, v, far, avoid):
+def is_safe_among_all(i, r, v, far, avoid):
     """Whether the candidate of vehicle i is compatible with the present choices of all others and with obstacles."""
     for e in range(avoid.start[i], avoid.start[i + 1]):
         j, floor = avoid.near[e], avoid.floor[e]
@@ -434,7 +434,7 @@ def propose_acceleration(i, k, v, avoid, c):
 
 
 @jit
-def least_margin_if_braking(i, r, v, too_late, avoid):
+def obstacle_margin_if_braking(i, r, v, too_late, avoid):
     """What `choose_acceleration` compares of vehicle i, if it brakes [m]."""
     c = avoid.trial[3]
     write_braking_acceleration(i, v[i], avoid, c)
@@ -463,7 +463,7 @@ def choose_acceleration(i, r, v, avoid):
         if away >= best:  # before it is tried: distances cost far more
             continue
         far = predict_motion(i, r[i], v_i, c, avoid, avoid.trial)
-        if not is_safe(i, r, v, far, avoid):
+        if not is_safe_among_all(i, r, v, far, avoid):
             continue
         room = miss_distance(r[i], v_i, c, avoid) if late else moving_obstacle_margin(i, v_i, avoid)
         if late or room < 0.0:
@@ -472,14 +472,14 @@ def choose_acceleration(i, r, v, avoid):
             continue
         best, nearest = away, k
         if k == 0:
-            adopt_candidate(i, far, avoid)
+            commit_trial(i, far, avoid)
             return 0
     if nearest < 0:
-        if second < 0 or least_margin_if_braking(i, r, v, late, avoid) >= most:
+        if second < 0 or obstacle_margin_if_braking(i, r, v, late, avoid) >= most:
             return 2
         nearest = second
     propose_acceleration(i, nearest, v_i, avoid, c)
-    adopt_candidate(i, predict_motion(i, r[i], v_i, c, avoid, avoid.trial), avoid)
+    commit_trial(i, predict_motion(i, r[i], v_i, c, avoid, avoid.trial), avoid)
     return 1
 
 
@@ -523,10 +523,10 @@ def set_wanted_acceleration(i, state, avoid):
 
 
 @jit
-def lag_compensating_choice(i, q, avoid):
-    """The choice, along axis q, that has vehicle i follow what it is asked for at once."""
-    return avoid.commanded[i, q] + (1.0 + avoid.ahead[i, q, 2] / avoid.period) * (
-        avoid.requested[i, q] - avoid.commanded[i, q]
+def lag_compensating_choice(i, axis, avoid):
+    """The choice, along an axis, that has vehicle i follow what it is asked for at once."""
+    return avoid.commanded[i, axis] + (1.0 + avoid.ahead[i, axis, 2] / avoid.period) * (
+        avoid.requested[i, axis] - avoid.commanded[i, axis]
     )
 
 
@@ -562,7 +562,7 @@ def correct_forces(p, w, flight, state, avoid):
     r, v, k = avoid.known[0], avoid.known[1], state.count[FLIGHT_TICKS]
     if avoid.filtered:
         weaken_all_edge_forces(p, w, state, avoid)
-    write_measured_states(k, r, v, flight, state)
+    write_measured_r_and_v(k, r, v, flight, state)
     for i in range(n):
         set_wanted_acceleration(i, state, avoid)
         if avoid.soft[i] > 0.0:
@@ -582,7 +582,7 @@ def correct_forces(p, w, flight, state, avoid):
         avoid.count[FULL] = 1
         return 0
     avoid.count[TICKS] += 1
-    brake_and_set_distances(t, r, v, lost, avoid)
+    brake_and_set_gaps_to_keep(t, r, v, lost, avoid)
     changed = avoid.filtered and filter_accelerations(t, r, v, lost, p, w, avoid)
     for k in range(n):
         i = (k + avoid.count[TICKS]) % n  # each comes first in turn
@@ -590,7 +590,7 @@ def correct_forces(p, w, flight, state, avoid):
             state.layers[i] = ACTS[BARRIER]
         if lost[i]:
             continue
-        free = is_alone(i, avoid) or not avoid.guarded
+        free = has_nothing_to_avoid(i, avoid) or not avoid.guarded
         # Its choice counts for those that come after it, who keep their distances from it: the order makes the proof.
         how = 0 if free else choose_acceleration(i, r, v, avoid)
         if free:

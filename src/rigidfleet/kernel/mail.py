@@ -110,7 +110,7 @@ def empty_mail(net: Links, iterations: int) -> Mail:
     )  # fmt: skip
 
 
-def give_edges_to_links(
+def write_edges_of_links(
     net: Links, mail: Mail, edges: Ints, integral: Floats, *, lose: bool = False
 ) -> None:
     """Give the links the edges (m, 2) of a phase; those that are new begin with their ``integral`` (m,) [m s].

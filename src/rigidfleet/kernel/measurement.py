@@ -68,7 +68,7 @@ def fit_quaternion(B, bound, K, V, w, q):
     # The eigenvector is a column of the adjugate; the longest one is accurate.
     most = 0.0
     for i in range(4):
-        length = write_cofactor_row(K, i, V[1])
+        length = write_4x4_cofactor_row(K, i, V[1])
         if length > most:
             most = length
             copy_vector(V[1], q)
@@ -89,7 +89,7 @@ def fit_quaternion(B, bound, K, V, w, q):
 
 
 @jit
-def write_cofactor_row(K, i, out):
+def write_4x4_cofactor_row(K, i, out):
     """Row i of the cofactors of K (4, 4) into out (4,); returns the square of their length."""
     a, b, c = K[0], K[1], K[2]
     if i < 3:
@@ -145,7 +145,7 @@ def write_matrix_quaternion(T, q):
 
 
 @jit
-def choose_quaternion_sign(q, last):
+def choose_sign_and_write_last(q, last):
     """Choose the sign of a quaternion q (4,): no jump from the one before, ``last``, or else q0 >= 0."""
     if math.isnan(q[0] + q[1] + q[2] + q[3]):
         return
@@ -192,23 +192,23 @@ def width_length_and_axis(p, mass, C, V, w, axis):
 
 
 @jit
-def write_attitude_of_line(x, p, mass, axis, near, T, now, there, across):
+def write_attitude_of_line(x, p, mass, axis, near, T, now, scratch, across):
     """Attitude T (3, 3) of a line: ``near``, followed by the smallest rotation that lays its axis along the agents."""
-    there[:] = 0.0
+    scratch[:] = 0.0
     for i in range(x.shape[0]):
         along = p[i, 0] * axis[0] + p[i, 1] * axis[1] + p[i, 2] * axis[2]
         along = along if mass[i] > 0.0 else 0.0  # agents that are lost do not count
         for a in range(3):
-            there[a] += along * x[i, a]
-    length = math.sqrt(there[0] ** 2 + there[1] ** 2 + there[2] ** 2)
+            scratch[a] += along * x[i, a]
+    length = math.sqrt(scratch[0] ** 2 + scratch[1] ** 2 + scratch[2] ** 2)
     if length == 0.0:
         copy(near, T)
         return
     multiply_transposed(near, axis, now)
     close = square = 0.0  # 1 + c with the cosine c of the angle, accurate up to half a turn
     for a in range(3):
-        there[a] /= length
-        close += 0.5 * (now[a] + there[a]) ** 2
+        scratch[a] /= length
+        close += 0.5 * (now[a] + scratch[a]) ** 2
     if close < _HALF_TURN:
         # Half a turn, about any axis perpendicular to the line: R = 2 n n^T - 1
         k = 0
@@ -226,7 +226,7 @@ def write_attitude_of_line(x, p, mass, axis, near, T, now, there, across):
     # T = near R^T with R = 1 + [n x] + [n x]^2 / (1 + c), n = now x there
     for a in range(3):
         b, c = (a + 1) % 3, (a + 2) % 3
-        across[a] = now[b] * there[c] - now[c] * there[b]
+        across[a] = now[b] * scratch[c] - now[c] * scratch[b]
         square += across[a] * across[a]
     for k in range(3):
         along = near[k, 0] * across[0] + near[k, 1] * across[1] + near[k, 2] * across[2]
@@ -237,15 +237,15 @@ def write_attitude_of_line(x, p, mass, axis, near, T, now, there, across):
 
 
 @jit
-def write_inertia_inverse_of_line(I, lifted, axis, out):
+def write_inertia_inverse_of_line(I, scratch_matrix, scratch_axis, out):
     """Pseudo-inverse of an inertia I (3, 3) into out, without the spin of a line about itself.
 
-    ``lifted`` (3, 3) and ``axis`` (3,) are scratch.
+    ``scratch_matrix`` (3, 3) and ``scratch_axis`` (3,) are scratch.
     """
     first = I[0, 0] + I[1, 1] + I[2, 2]
     second = I[0, 0] * I[1, 1] + I[0, 0] * I[2, 2] + I[1, 1] * I[2, 2]
     second -= I[0, 1] * I[0, 1] + I[0, 2] * I[0, 2] + I[1, 2] * I[1, 2]
-    third = write_eigenvector_of_value(I, 0.0, axis)
+    third = write_eigenvector_of_value(I, 0.0, scratch_axis)
     if not second > 0.0:
         out[:] = 0.0
         return
@@ -263,14 +263,14 @@ def write_inertia_inverse_of_line(I, lifted, axis, out):
         inertia_inverse(I, out)
         return
     # I + largest n n^T, n the axis of the least inertia, has no small eigenvalue.
-    write_eigenvector_of_value(I, x, axis)
+    write_eigenvector_of_value(I, x, scratch_axis)
     for a in range(3):
         for b in range(3):
-            lifted[a, b] = I[a, b] + largest * axis[a] * axis[b]
-    inertia_inverse(lifted, out)
+            scratch_matrix[a, b] = I[a, b] + largest * scratch_axis[a] * scratch_axis[b]
+    inertia_inverse(scratch_matrix, out)
     for a in range(3):
         for b in range(3):
-            out[a, b] -= axis[a] * axis[b] / (x + largest)
+            out[a, b] -= scratch_axis[a] * scratch_axis[b] / (x + largest)
 
 
 @jit
@@ -373,13 +373,13 @@ def measure_samples(m):
                 attitude_matrix(m.attitude[k], T)
             else:
                 m.attitude[k] = math.nan
-            choose_quaternion_sign(m.attitude[k], last[0])
+            choose_sign_and_write_last(m.attitude[k], last[0])
             if not math.isnan(m.T_ref[k, 0, 0]):
                 write_matrix_quaternion(m.T_ref[k], m.attitude_reference[k])
-                choose_quaternion_sign(m.attitude_reference[k], last[1])
+                choose_sign_and_write_last(m.attitude_reference[k], last[1])
             if k == 0 or math.isnan(last[2, 0]):
                 copy_vector(m.frame[k], last[2])
-            choose_quaternion_sign(m.frame[k], last[2])
+            choose_sign_and_write_last(m.frame[k], last[2])
             write_angular_momentum(m, k, mass, h)
             inertia(m.x[0], mass, zero, I)
             if line:
@@ -394,11 +394,11 @@ def measure_samples(m):
             else:
                 multiply(T, omega, m.rates[k])
                 if left < n:
-                    recentre_incomplete_body(m, k, T, centre, omega, h)
+                    move_cm_of_incomplete_body(m, k, T, centre, omega, h)
 
 
 @jit
-def recentre_incomplete_body(m, k, T, centre, omega, offset):
+def move_cm_of_incomplete_body(m, k, T, centre, omega, offset):
     """Move the centre of mass of the agents left to the origin of the body, of which some agents are missing."""
     multiply_transposed(T, centre, offset)
     for a in range(3):

@@ -23,13 +23,13 @@ from rigidfleet.kernel.bernstein import (
     CLOSE,
     ball_radius,
     distance_to_box,
+    gap_and_normal,
     least_height_in_cylinder,
     least_norm_above,
     least_norm_of_curve,
     least_polynomial_value,
     norm_at,
     point_at,
-    tangent_of_box,
     write_bernstein_basis,
     write_squared_norm_coefficients,
 )
@@ -193,7 +193,7 @@ def write_mean_control_points(points, monitor, mean):
 
 
 @jit
-def rotation_over_step(points, mean, monitor):
+def rotation_vector_over_step(points, mean, monitor):
     """Rotation [rad] about each axis by which agents turn about their mean over a step.
 
     It is that of a rigid body with their moment of momentum, for equal masses at the places halfway: no other leaves
@@ -224,7 +224,7 @@ def rotation_over_step(points, mean, monitor):
 
 
 @jit
-def bound_distance_changes(p, state, monitor):
+def write_first_step_change_bounds(p, state, monitor):
     """Bounds [m] of the change of any distance over the trail's first step, in space and as seen from above.
 
     They are written into ``monitor.moves``. With r_i' = any rigid motion + u_i, the rate of a distance is at most
@@ -233,7 +233,7 @@ def bound_distance_changes(p, state, monitor):
     """
     points, mean = state.trail.points[trail_row_of(0, state)], monitor.knots
     write_mean_control_points(points, monitor, mean)
-    turn_x, turn_y, turn_z = rotation_over_step(points, mean, monitor)
+    turn_x, turn_y, turn_z = rotation_vector_over_step(points, mean, monitor)
     fastest = farthest = 0.0
     for i in range(monitor.left.shape[0]):
         if not monitor.left[i]:
@@ -412,7 +412,7 @@ def watch_obstacles(i, curve, t, h, last, monitor):
     if not last or not (standing or monitor.low[i, 0] < math.inf):
         return
     for b in range(monitor.boxes.shape[0]):
-        end, _, _, up = tangent_of_box(curve[4, 0], curve[4, 1], curve[4, 2], b, -1, monitor.boxes)
+        end, _, _, up = gap_and_normal(curve[4, 0], curve[4, 1], curve[4, 2], b, -1, monitor.boxes)
         if end - radius <= monitor.pad and up >= STEEP:
             return
     note_obstacle_departure(i, monitor)
@@ -422,11 +422,11 @@ def watch_obstacles(i, curve, t, h, last, monitor):
 def watch_trail_distances(first, end, p, state, monitor):
     """Take the extremes of distances and speeds over the steps of a trail from ``first`` to before ``end``."""
     for step in range(first, end):
-        watch_step_distances(step, p, state, monitor)
+        watch_distances_and_speeds(step, p, state, monitor)
 
 
 @jit
-def watch_step_distances(step, p, state, monitor):
+def watch_distances_and_speeds(step, p, state, monitor):
     """Take the extremes of distances and speeds over one step of the trail."""
     trail, row, n = state.trail, trail_row_of(step, state), monitor.left.shape[0]
     points, t, h = trail.points[row], trail.clock[row, 0], trail.clock[row, 1]
@@ -526,7 +526,7 @@ def evaluate_forces(t, step, p, w, state, monitor, values):
 
 
 @jit
-def parabola_excess(c, worst, a, b, v, ta, tb, tc, p, monitor):
+def parabola_excess_and_time(c, worst, a, b, v, ta, tb, tc, p, monitor):
     """Expected excess over the worst value, and its time, from the parabola through |values| a, b, v at ta < tb < tc.
 
     The excess of entry c is a share of the worst value, with the rise to the top of the parabola counted twice. It is
@@ -557,7 +557,7 @@ def parabola_excess(c, worst, a, b, v, ta, tb, tc, p, monitor):
 
 @jit
 def most_promising_peak(before, middle, after, ta, tb, tc, best, top, p, monitor):
-    """The greatest `parabola_excess` of all entries, and its time; ``best`` and ``top`` if none is greater.
+    """The greatest `parabola_excess_and_time` of all entries, and its time; ``best`` and ``top`` if none is greater.
 
     Few entries pass the bound by the worst values, which are ``monitor.gauge[2]``.
     """
@@ -568,7 +568,7 @@ def most_promising_peak(before, middle, after, ta, tb, tc, best, top, p, monitor
     for c in range(middle.shape[0]):
         a, b, v = abs(before[c]), abs(middle[c]), abs(after[c])
         if b + max(left * (b - a), right * (b - v)) > worst[c]:
-            more, at = parabola_excess(c, worst[c], a, b, v, ta, tb, tc, p, monitor)
+            more, at = parabola_excess_and_time(c, worst[c], a, b, v, ta, tb, tc, p, monitor)
             if more > best:
                 best, top = more, at
     return best, top

@@ -16,7 +16,7 @@ import math
 from rigidfleet.kernel.avoidance import FOLLOWED, KNOWN, UNKNOWN
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import jit
-from rigidfleet.kernel.segments import obstacle_distance, parabola_min, segment_obstacle_bounds
+from rigidfleet.kernel.segments import least_value, obstacle_distance, segment_obstacle_bounds
 from rigidfleet.solids.distance import is_solid_present, solid_displacement
 
 #: Standard deviations that bounds of an estimate have.
@@ -78,28 +78,28 @@ def obstacle_velocity(t, o, solids):
 
 
 @jit
-def is_in_sight(o, x, y, z, r, lost, avoid):
-    """Whether any vehicle is within sensing range of obstacle o, displaced by x, y, z [m]."""
+def is_in_sight(o, dx, dy, dz, r, lost, avoid):
+    """Whether any vehicle is within sensing range of obstacle o, displaced by dx, dy, dz [m]."""
     solids, reach = avoid.solids, avoid.sight.reach
     for i in range(r.shape[0]):
-        u, v, w = r[i, 0] - x, r[i, 1] - y, r[i, 2] - z
+        u, v, w = r[i, 0] - dx, r[i, 1] - dy, r[i, 2] - dz
         if not lost[i] and obstacle_distance(u, v, w, o, solids, avoid.normal) <= reach:
             return True
     return False
 
 
 @jit
-def track_obstacle(o, k, x, y, z, u, v, w, avoid):
-    """Take a measurement of obstacle o at tick k, at the displacement x, y, z [m] with the velocity u, v, w [m/s]."""
+def track_obstacle(o, tick, dx, dy, dz, u, v, w, avoid):
+    """Take a measurement of obstacle o at a tick, displaced by dx, dy, dz [m] with the velocity u, v, w [m/s]."""
     s = avoid.sight
     track, spread, seen = s.track[o], s.spread[o], avoid.shifted[0]
-    seen[0], seen[1], seen[2] = x, y, z
+    seen[0], seen[1], seen[2] = dx, dy, dz
     if s.noise == 0.0:
-        track[0], track[1], track[2], track[3], track[4], track[5] = x, y, z, u, v, w
+        track[0], track[1], track[2], track[3], track[4], track[5] = dx, dy, dz, u, v, w
         spread[0], spread[1], spread[2] = 0.0, 0.0, 0.0
         return
     for axis in range(3):
-        at = (3 * (k * s.moves.shape[0] + o) + axis) % s.normals.shape[0]
+        at = (3 * (tick * s.moves.shape[0] + o) + axis) % s.normals.shape[0]
         seen[axis] += s.noise * s.normals[at]
     if s.known[o] == UNKNOWN:
         for axis in range(3):
@@ -233,7 +233,7 @@ def moving_obstacle_margin(i, v, avoid):
             along += normal[q] * (out[1, q] - out[0, q])
             rate += normal[q] * out[3, q]
             lift += normal[q] * way[4, q]
-        room = min(room, parabola_min(value - share * along, rate, min(lift, lift * E), T) - floor)
+        room = min(room, least_value(value - share * along, rate, min(lift, lift * E), T) - floor)
     return room
 
 

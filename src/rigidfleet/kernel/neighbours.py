@@ -78,14 +78,14 @@ def fade_silent_edges(i, k, ticks, net, mail):
 
 
 @jit
-def extrapolate_neighbour(j, axis, age, message, tracks, w, k1, k2):
+def extrapolate_neighbour(j, axis, age, message, tracks_slots, w, k1, k2):
     """Where vehicle j is along an axis, how fast, and what its input accelerates it by, ``age`` [s] after a message.
 
     What it is off its slot moves on by its acceleration; the slot moves as planned, whatever the age. Without a slot,
     the vehicle itself moves on. Its input follows what it is off by the gains k1 [1/s^2] and k2 [1/s].
     """
     r, v, a, put = message[R + axis], message[V + axis], message[A + axis], message[U + axis]
-    if not tracks or message[TRACKED] == 0.0:  # or sent before slots were tracked
+    if not tracks_slots or message[TRACKED] == 0.0:  # or sent before slots were tracked
         return r + age * (v + 0.5 * age * a), v + age * a, put
     v, a = v - message[SLOT + 3 + axis], a - message[SLOT + 6 + axis]
     place = w.r_ref[j, axis] + r - message[SLOT + axis] + age * (v + 0.5 * age * a)

@@ -30,7 +30,7 @@ from rigidfleet.solids.distance import (
     outward_normal,
     signed_distance,
     solid_displacement,
-    vector_from_triangle,
+    triangle_vector_and_square,
 )
 from rigidfleet.solids.records import HEIGHTS
 
@@ -40,11 +40,11 @@ _SHORTEST = 2.0**-32
 
 @jit
 def solid_gap_and_normal(x, y, z, b, triangle, solids):
-    """As `bernstein.tangent_of_box`, of solid b, or of one of its triangles if that is not -1."""
+    """As `bernstein.gap_and_normal`, of solid b, or of one of its triangles if that is not -1."""
     if triangle < 0:
         nx, ny, nz = outward_normal(x, y, z, b, solids)
         return signed_distance(x, y, z, b, solids), nx, ny, nz
-    nx, ny, nz, squared = vector_from_triangle(x, y, z, solids.triangles[triangle])
+    nx, ny, nz, squared = triangle_vector_and_square(x, y, z, solids.triangles[triangle])
     away = math.sqrt(squared)
     if away == 0.0:
         return 0.0, 0.0, 0.0, 0.0
@@ -52,7 +52,7 @@ def solid_gap_and_normal(x, y, z, b, triangle, solids):
 
 
 #: As `distance_to_box`, of solid b or of one of its triangles.
-nearest_along = compiled_copy(distance_to_box, "nearest_along", tangent_of_box=solid_gap_and_normal)
+nearest_along = compiled_copy(distance_to_box, "nearest_along", gap_and_normal=solid_gap_and_normal)
 
 
 @jit

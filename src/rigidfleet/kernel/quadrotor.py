@@ -13,7 +13,7 @@ from rigidfleet.kernel.disturbances import ground_damping_and_lift
 from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.rigid_body import attitude_matrix, quaternion_rate
 from rigidfleet.kernel.vectors import as_lanes
-from rigidfleet.solids.distance import height_below
+from rigidfleet.solids.distance import top_of_solids_below
 
 #: Rows of `SampledWork.y`.
 _START, _TRIAL, _RATES, _END = 0, 1, 2, 6
@@ -47,7 +47,7 @@ def write_quadrotor_derivative(y, command, i, vehicles, around, air, push, T, dy
     m, inertia = vehicles.m[i], vehicles.inertia[i]
     damping, lift = 0.0, 0.0
     if vehicles.lost[i]:
-        over = height_below(y[0], y[1], y[2], around.roofs) + around.radius[i]
+        over = top_of_solids_below(y[0], y[1], y[2], around.roofs) + around.radius[i]
         damping, lift = ground_damping_and_lift(m, vehicles.g, max(around.floor[i], over), y[2])
     if vehicles.point[i]:
         write_point_derivative(y, command, i, vehicles, air, push, dy)
@@ -70,7 +70,7 @@ def write_quadrotor_derivative(y, command, i, vehicles, around, air, push, T, dy
         M0 = M1 = M2 = momentum = turning = 0.0
         gain = 1.0
         if around.ground_effect:
-            over = max(around.ground, height_below(y[0], y[1], y[2], around.roofs))
+            over = max(around.ground, top_of_solids_below(y[0], y[1], y[2], around.roofs))
             if over > -math.inf:
                 gain = ground_effect_factor(y[2] - over, vehicles.radius[i], vehicles.span[i])
         k0 = gain * vehicles.thrust[i, 0]

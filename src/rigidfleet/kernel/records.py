@@ -106,7 +106,7 @@ class Monitor(NamedTuple):
     struck: Pairs  # of a lost agent and one still flying
     columns: Pairs  # that may fly one below the other
     count: Ints  # (1,) see `STAYED`
-    moves: Floats  # (2,) bounds of the change of any distance [m], see `monitor.bound_distance_changes`
+    moves: Floats  # (2,) bounds of the change of any distance [m], see `monitor.write_first_step_change_bounds`
     recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
     segment: int
     record: int

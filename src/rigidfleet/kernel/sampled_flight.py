@@ -14,9 +14,9 @@ from rigidfleet.kernel.clock_records import OFF, RATE, SLOPE
 from rigidfleet.kernel.clocks import (
     advance_clocks,
     apply_own_clock,
-    drop_own_constraint_force,
     post_clock,
     write_slots_by_own_clock,
+    zero_own_constraint_force,
 )
 from rigidfleet.kernel.compiler.calls import call_external, call_recorder
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
@@ -198,7 +198,7 @@ def record_if_worse(i, kind, value, t, state):
 @jit
 def write_states_and_plan(k, t, p, w, flight, state):
     """What each vehicle knows at tick k, time t [s], into w: its measured state and, by one clock, the plan."""
-    write_measured_states(k, w.r, w.v, flight, state)
+    write_measured_r_and_v(k, w.r, w.v, flight, state)
     if not flight.clocks.own:
         evaluate_plan(t, p, w)
 
@@ -229,7 +229,7 @@ def evaluate_distributed_law(k, t, dt, p, w, flight, state):
         else:
             solve_own_constraint_force(i, k, dt, tick, p, w, net, mail, state.saturated[i])
         if stuck:
-            drop_own_constraint_force(i, w, net, state)
+            zero_own_constraint_force(i, w, net, state)
         write_desired_force(k, i, dt, p, w, flight, state)
         for q in range(3):
             mail.commanded[i, q] = state.force[i, q] * p.vehicles.inverse[i]
@@ -256,7 +256,7 @@ def evaluate_plan(t, p, w):
 
 
 @jit
-def write_measured_states(k, r, v, flight, state):
+def write_measured_r_and_v(k, r, v, flight, state):
     """Measured states of vehicles at tick k, each of its own, into r and v (N, 3)."""
     for i in range(state.S.shape[0]):
         for q in range(3):
@@ -268,7 +268,7 @@ def write_measured_states(k, r, v, flight, state):
 def prepare_messages(k, p, w, flight, state):
     """Have ready what each vehicle could send at tick k: what it knows of itself, and what it does."""
     mail, row = state.mail, k % state.mail.due.shape[1]
-    write_measured_states(k, w.r, w.v, flight, state)
+    write_measured_r_and_v(k, w.r, w.v, flight, state)
     for i in range(state.S.shape[0]):
         message, m = mail.post[row, i], p.vehicles.inverse[i]
         for q in range(3):
@@ -361,7 +361,7 @@ def receive_messages(k, flight, state):
 
 
 @jit
-def run_tick(k, t, p, w, flight, state, call):
+def measure_and_command_rotors(k, t, p, w, flight, state, call):
     """Measure, desire and steer at tick k, time t [s]; returns False if the law gives no force."""
     if flight.network.every > 0:
         receive_messages(k, flight, state)
@@ -572,7 +572,7 @@ def fly_ticks(p, w, flight, state, call):
             if flight.commands.kind == OWN and k % flight.every == 0 and count[ANSWERED] <= k:
                 measure_for_laws(k, t, p, w, flight, state)
                 return ASKS
-            if not run_tick(k, t, p, w, flight, state, call):
+            if not measure_and_command_rotors(k, t, p, w, flight, state, call):
                 return COLLAPSED
             count[TICKS] = k + 1
         grid, until = flight.start + (step + 1) * flight.h, flight.start + step * flight.h

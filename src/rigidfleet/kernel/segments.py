@@ -135,7 +135,7 @@ def refined_obstacle_distance(p, q, o, solids, need, normal):
 
 
 @jit
-def parabola_min(x, rate, rise, T):
+def least_value(x, rate, rise, T):
     """Least value of x + rate t + rise t^2 / 2 over [0, T]."""
     least = min(x, x + T * (rate + 0.5 * T * rise))
     if rise > 0.0 and -rise * T < rate < 0.0:

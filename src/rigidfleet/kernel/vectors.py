@@ -6,7 +6,7 @@ A vector holds eight consecutive states of one flight, or the same state of eigh
 - ``as_lanes(rows)``: float64 rows (k, n), n a multiple of 8, viewed as vectors (k, n / 8); rows of vectors unchanged;
 - ``fill_lanes(x)``: a vector of eight numbers x;
 - ``rough_inverse(v)``: 1/v to four digits, in a fraction of a quotient's time;
-- ``sum_lanes_or_worst(v, y)``: a vector's sum if y are states of one flight, its greatest number if of eight.
+- ``sum_lanes_or_worst_flight(v, y)``: a vector's sum if y are states of one flight, its greatest number if of eight.
 
 These are names of `rigidfleet.kernel.compiler.simd`. Functions around them would cost the integrator some per cent.
 """
@@ -15,12 +15,12 @@ from rigidfleet.kernel.compiler.simd import (
     as_lanes,
     fill_lanes,
     rough_inverse,
-    sum_lanes_or_worst,
+    sum_lanes_or_worst_flight,
 )
 
 __all__ = [
     "as_lanes",
     "fill_lanes",
     "rough_inverse",
-    "sum_lanes_or_worst",
+    "sum_lanes_or_worst_flight",
 ]

@@ -87,7 +87,7 @@ def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = N
     # J J^T without J: u_ij^T u_kl, by the agents that two edges share.
     ends = np.transpose(edges)
     u, incidence = _unit_vectors(r, *ends), np.subtract(*np.eye(r.shape[1])[ends])
-    return _root_of_least_eigenvalue((u @ u.swapaxes(1, 2)) * (incidence @ incidence.T))
+    return _least_nonzero_singular_value((u @ u.swapaxes(1, 2)) * (incidence @ incidence.T))
 
 
 def least_singular(J: Floats, masses: ArrayLike | None = None) -> Floats:
@@ -97,7 +97,7 @@ def least_singular(J: Floats, masses: ArrayLike | None = None) -> Floats:
         J = J * np.repeat(np.sqrt(m.mean() / m), 3)
     # The smaller Gram matrix takes a third of the time of a decomposition of J itself.
     turned = J.swapaxes(1, 2)
-    return _root_of_least_eigenvalue(J @ turned if J.shape[1] <= J.shape[2] else turned @ J)
+    return _least_nonzero_singular_value(J @ turned if J.shape[1] <= J.shape[2] else turned @ J)
 
 
 def _least_singular_of_three_edges(r: Floats, edges: Ints) -> Floats:
@@ -119,19 +119,19 @@ def _least_singular_of_three_edges(r: Floats, edges: Ints) -> Floats:
     spread = np.add.reduce((0.5 * p + 3.0 * square[[2, 0, 1]]) * apart * apart)
     angle = np.arctan2(np.sqrt(spread), np.sqrt(27.0) * c[0] * c[1] * c[2]) / 3.0
     turns = 2.0 * np.pi / 3.0 * np.array([[1.0], [2.0], [0.0]])
-    return _root_of_least((2.0 + 2.0 * np.sqrt(p / 3.0) * np.cos(angle + turns)).T)
+    return _root_of_least_nonzero((2.0 + 2.0 * np.sqrt(p / 3.0) * np.cos(angle + turns)).T)
 
 
-def _root_of_least_eigenvalue(gram: Floats) -> Floats:
+def _least_nonzero_singular_value(gram: Floats) -> Floats:
     """Roots (K,) of the smallest non-zero eigenvalues of matrices (K, s, s), NaN of those that are not finite."""
     known = np.isfinite(gram).all(axis=(1, 2))
     gram[~known] = 0.0
     w = np.asarray(np.linalg.eigvalsh(gram), dtype=float)
     w[~known] = np.nan
-    return _root_of_least(w)
+    return _root_of_least_nonzero(w)
 
 
-def _root_of_least(w: Floats) -> Floats:
+def _root_of_least_nonzero(w: Floats) -> Floats:
     """Roots (K,) of the smallest of eigenvalues (K, s), in ascending order, that are not zero."""
     w[w < 1e-14 * w[:, -1:]] = np.inf
     return np.sqrt(w.min(axis=1))

@@ -46,7 +46,7 @@ def infinite_horizon(
     does so at least cost.
     """
     A, B, Q, R, N = _check_system(A, B, Q, R, N)
-    F, G, W = _without_cross_weight(A, B, Q, R, N)
+    F, G, W = _a_g_q_without_cross_weight(A, B, Q, R, N)
     for s in np.linalg.eigvals(A):
         mode = A - s * np.eye(len(A))
         if s.real >= 0.0 and np.linalg.matrix_rank(np.hstack([mode, B])) < len(A):
@@ -97,7 +97,7 @@ def finite_horizon(
     A, B, Q, R, N = _check_system(A, B, Q, R, N)
     S = _weight_matrix("S", S, len(A))
     P = riccati.cost_to_go(
-        *_without_cross_weight(A, B, Q, R, N), S, _check_times("time_to_go", time_to_go)
+        *_a_g_q_without_cross_weight(A, B, Q, R, N), S, _check_times("time_to_go", time_to_go)
     )
     return P, riccati.solve_linear(R, B.T @ P + N.T)
 
@@ -251,7 +251,7 @@ def knots(
         largest = np.maximum(largest, np.abs(x).max(axis=(0, 1)))
         # In units of the piece's width, so that one set of powers serves all pieces.
         ends = [z[:, [0, -1]] for z in (x[:, :, 0], width * x[:, :, 1], width**2 * a)]
-        c = _quintic_coefficients(np.ones(len(left)), *(z.swapaxes(0, 1) for z in ends))
+        c = _quintics_between_end_states(np.ones(len(left)), *(z.swapaxes(0, 1) for z in ends))
         quintic = np.stack([c @ u.T, c @ u_dot.T / width], axis=2)
         deviation = quintic - x[:, 1:-1].transpose(0, 3, 2, 1)
         # Rounding of the positions enters the quintic's velocity divided by the width.
@@ -281,10 +281,10 @@ def quintic_pieces(times: ArrayLike, x: ArrayLike, v: ArrayLike, a: ArrayLike) -
             f"x, v and a must have one row for each of the {len(t)} times and the same shape,"
             f" not {x.shape}, {v.shape} and {a.shape}"
         )
-    return _quintic_coefficients(h, (x[:-1], x[1:]), (v[:-1], v[1:]), (a[:-1], a[1:]))
+    return _quintics_between_end_states(h, (x[:-1], x[1:]), (v[:-1], v[1:]), (a[:-1], a[1:]))
 
 
-def _quintic_coefficients(h: Floats, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
+def _quintics_between_end_states(h: Floats, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
     """Coefficients (n, ..., 6) from both ends' (2, n, ...) values, widths h (n,)."""
     (x0, x1), (v0, v1), (a0, a1) = (np.asarray(z) for z in (x, v, a))
     h = h.reshape(-1, *[1] * (x0.ndim - 1))
@@ -305,7 +305,7 @@ def _unit_responses(
     t, T = _check_times("times", times), float(_check_times("T", T))
     if t.ndim != 1 or np.any(t > T * (1.0 + 1e-12)):
         raise ValueError(f"times must be a list of times between 0 and T = {T} s")
-    P, x = riccati.costs_and_states(*_without_cross_weight(A, B, Q, R, N), S, t, T)
+    P, x = riccati.costs_and_states(*_a_g_q_without_cross_weight(A, B, Q, R, N), S, t, T)
     return x, -riccati.solve_linear(R, (B.T @ P + N.T) @ x)
 
 
@@ -322,7 +322,7 @@ def _double_integrator_cost(Q: ArrayLike, R: ArrayLike) -> Floats:
     return np.array([[cross * last / r - b, cross], [cross, last]])
 
 
-def _without_cross_weight(
+def _a_g_q_without_cross_weight(
     A: Floats, B: Floats, Q: Floats, R: Floats, N: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """The same problem without N, for the input u + R^-1 N^T x: its A, B R^-1 B^T and Q."""

@@ -397,7 +397,7 @@ def stability_margins(loops: Sequence[Loop], law: LoopGains, growth: float = GRO
         return Margins(stable=False)
     low, high, phase, delay = 0.0, math.inf, math.pi, math.inf
     for loop in loops:
-        omega, loci, on_axis = _crossovers(loop, law)
+        omega, loci, on_axis = _crossovers_loci_and_are_real(loop, law)
         gain = 1.0 / np.abs(loci[on_axis])
         high = min(high, gain[gain > 1].min(initial=math.inf))
         low = max(low, gain[gain <= 1].max(initial=0.0))
@@ -407,7 +407,7 @@ def stability_margins(loops: Sequence[Loop], law: LoopGains, growth: float = GRO
     return Margins(True, (float(low), float(high)), float(phase), float(delay))
 
 
-def _crossovers(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes, Bools]:
+def _crossovers_loci_and_are_real(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes, Bools]:
     """Frequencies (M,) [rad/s] where a locus is negative real or has unit gain; the loci there; which are real."""
     omega, loci = _frequencies_and_log_loci(loop, law)
     # Numbers of log(locus) that are whole where a locus is negative real, and that change sign at unit gain.

@@ -145,19 +145,19 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
     if r.shape[1] > _MANY:
         least, pair = np.empty(len(r)), np.empty((len(r), 2), dtype=np.int64)
         for k, points in enumerate(r):
-            least[k], pair[k] = _least_headroom(points, radius)
+            least[k], pair[k] = _least_vertical_gap(points, radius)
         return least, pair
 
-    def height(d: Floats, radii: Floats) -> Floats:
+    def vertical_gap(d: Floats, radii: Floats) -> Floats:
         overlap = d[0] ** 2 + d[1] ** 2 <= radii**2  # false for agents without a position
         if not overlap.any():
             return np.broadcast_to(np.inf, overlap.shape)
         return np.where(overlap & np.isfinite(d[2]), np.abs(d[2]) - radii, np.inf)
 
-    return _least_of_pairs(r, radius, height)
+    return _least_of_pairs(r, radius, vertical_gap)
 
 
-def _least_headroom(r: Floats, radius: Floats) -> tuple[float, Ints]:
+def _least_vertical_gap(r: Floats, radius: Floats) -> tuple[float, Ints]:
     """Least height between two of many agents (N, 3), one below the other, and the pair."""
     from scipy.spatial import KDTree
 

@@ -77,14 +77,14 @@ def flat(force: Floats, yaw: Floats) -> Flat:
     y, _ = _unit_with_derivatives(_cross_with_derivatives(z, heading))
     x = _cross_with_derivatives(y, z)
 
-    def dot_with_rate(a: Floats, b: Floats) -> tuple[Floats, Floats]:
+    def dot_b_rate_and_rate(a: Floats, b: Floats) -> tuple[Floats, Floats]:
         """a . b', and its derivative."""
         along = np.einsum("ki,ki->k", a[:, 0], b[:, 1])
         turn = np.einsum("ki,ki->k", a[:, 1], b[:, 1]) + np.einsum("ki,ki->k", a[:, 0], b[:, 2])
         return along, turn
 
     # R^T R' = [omega x], column by column
-    parts = [dot_with_rate(z, y), dot_with_rate(x, z), dot_with_rate(y, x)]
+    parts = [dot_b_rate_and_rate(z, y), dot_b_rate_and_rate(x, z), dot_b_rate_and_rate(y, x)]
     omega, omega_dot = (np.stack(column, axis=1) for column in zip(*parts, strict=True))
     return Flat(thrust, np.stack([x[:, 0], y[:, 0], z[:, 0]], axis=2), omega, omega_dot)
 

@@ -81,7 +81,7 @@ def rotation_series(phi: Floats, orders: int | None = None) -> Floats:
     """
     count = 2 * len(phi) + 1  # of functions; two fewer with each order
     x = np.ascontiguousarray(phi[:orders].transpose(0, -1, *range(1, phi.ndim - 1)))
-    c0, c1, c2 = _stumpff_series(product(x, x).sum(axis=1), count)
+    c0, c1, c2 = _stumpff_of_taylor_series(product(x, x).sum(axis=1), count)
     S = product(c1[:, None], x)
     P = product(product(c2[:, None], x)[:, [0, 1, 2, 0, 0, 1]], x[:, [0, 1, 2, 1, 2, 2]])
     P[:, :3] += c0[:, None]
@@ -173,7 +173,7 @@ def _stumpff(u: Floats, count: int) -> Floats:
     return np.where(near, values, np.stack(closed))
 
 
-def _stumpff_series(u: Floats, count: int) -> tuple[Floats, Floats, Floats]:
+def _stumpff_of_taylor_series(u: Floats, count: int) -> tuple[Floats, Floats, Floats]:
     """Series (n, ...) of c_0(u), c_1(u) and c_2(u) of a series u (n, ...), by so many Stumpff functions.
 
     c_k' = (k c_(k+2) - c_(k+1)) / 2 gives each order from the order before of the following functions.

@@ -158,7 +158,7 @@ def smooth(
     numbers, about = 3 * max(len(samples.time) - 3, 1), np.zeros((count, 3))
     third = np.zeros((whole, 3))  # differences of ``about``
 
-    def solve_and_factor(weight: Floats) -> tuple[Floats, Floats, Floats]:
+    def points_right_side_and_factor(weight: Floats) -> tuple[Floats, Floats, Floats]:
         """Control points from ``about`` on (C, 3), what they were solved of, and the factor."""
         full, of = band.copy(), right.copy()
         for i in range(4):
@@ -170,7 +170,7 @@ def smooth(
 
     def evaluate(log_variance: float) -> tuple[float, float]:
         weight = calm * np.exp(-log_variance)
-        points, of, factor = solve_and_factor(weight)
+        points, of, factor = points_right_side_and_factor(weight)
         quadratic = squares + float((weight @ third**2).sum())
         quadratic = max(quadratic - float((points * of).sum()), 1e-12 * squares)
         of_points = 2.0 * float(np.log(factor[0]).sum()) + whole * log_variance
@@ -181,7 +181,7 @@ def smooth(
     zero = 0.0 if free else 2.0 * np.log(noise.sigma)  # in units of the noise, where it is known
     bounds = _SMALLEST + zero, _LARGEST + zero
     # Only what a first way leaves is fitted: of far positions, the quadratic would be all rounding.
-    about = solve_and_factor(calm * np.exp(-_FIRST - zero))[0]
+    about = points_right_side_and_factor(calm * np.exp(-_FIRST - zero))[0]
     third = np.diff(about, 3, axis=0)
     value = value - matrix @ about
     squares, right = float((value**2).sum()), matrix.T @ value
@@ -191,13 +191,13 @@ def smooth(
     weight = calm * np.exp(-best.x)
     random = np.random.default_rng(0)
     for _ in range(turns):
-        points, _, factor = solve_and_factor(weight)
+        points, _, factor = points_right_side_and_factor(weight)
         drawn = _precision_draws(factor, random.standard_normal((count, _DRAWN)))
         size = (np.diff(about + points, 3, axis=0) ** 2).sum(axis=1)
         size = size / variance + 3.0 * (np.diff(drawn, 3, axis=0) ** 2).mean(axis=1)
         weight = (_FREEDOM + 3.0) / (_FREEDOM / weight.mean() + size)
         weight = np.minimum(weight, np.exp(-bounds[0]))
-    points, _, factor = solve_and_factor(weight)
+    points, _, factor = points_right_side_and_factor(weight)
     sigma = float(np.sqrt(variance))
     residual = (value - matrix @ points) / sigma
     known = PositionNoise(sigma * unit.sigma, noise.tau)

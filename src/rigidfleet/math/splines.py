@@ -55,8 +55,8 @@ def minimum_snap(times: Floats, x: Floats, begin: Floats, end: Floats, *v: Float
     if inner > 0:
         each = np.zeros((4, inner + 2, 3, inner))
         each[1:, 1:-1] = np.eye(3 * inner).reshape(3, inner, 3, inner)
-        A = _jumps(t, each)  # (inner, 3, 3, inner): jumps of three derivatives, by each unknown
-        b = -_jumps(t, full)
+        A = _jumps_of_derivatives_4_to_6(t, each)  # (inner, 3, 3, inner): by each unknown
+        b = -_jumps_of_derivatives_4_to_6(t, full)
         for k, velocity in enumerate(v):
             if not np.isnan(velocity).any():
                 A[k, 2], b[k, 2] = 0.0, unit * velocity
@@ -66,7 +66,7 @@ def minimum_snap(times: Floats, x: Floats, begin: Floats, end: Floats, *v: Float
     return Piecewise.hermite(t, full).pieces / unit ** np.arange(POWERS)
 
 
-def _jumps(times: Floats, x: Floats) -> Floats:
+def _jumps_of_derivatives_4_to_6(times: Floats, x: Floats) -> Floats:
     """Jumps (n - 1, 3, ...) of derivatives 4, 5 and 6 at the inner times, of degree 7 through x (4, n + 1, ...)."""
     return np.moveaxis(Piecewise.hermite(times, x).jumps(7)[4:], 0, 1)
 
@@ -83,29 +83,29 @@ def snap_cost(pieces: Floats, knots: Floats) -> float:
     )
 
 
-def least_snap_knots(total: float, x: Floats, *state: Floats) -> Floats:
-    """Times (n + 1,) [s] from 0 to ``total`` at points x (n + 1, d) that make the snap of `minimum_snap` least.
+def least_snap_knot_times(total: float, points: Floats, *state: Floats) -> Floats:
+    """Times (n + 1,) [s] from 0 to ``total`` at points (n + 1, d) that make the snap of `minimum_snap` least.
 
     ``state`` are its arguments after the points. From times that grow with the square root of each distance, by a
     quasi-Newton search (Richter, Bry and Roy, 2013, search the times in the same way).
     """
     from scipy.optimize import minimize
 
-    n = len(x) - 1
+    n = len(points) - 1
     if n == 1:
         return np.array([0.0, total])
 
-    def times(shares: Floats) -> Floats:
-        parts = np.exp(shares - shares.max())
+    def times(log_shares: Floats) -> Floats:
+        parts = np.exp(log_shares - log_shares.max())
         return np.concatenate([[0.0], np.cumsum(parts) * (total / parts.sum())])
 
     def cost(shares: Floats) -> float:
         t = times(shares)
         if np.diff(t).min() < 1e-3 * total / n:
             return 1e3 * first
-        return float(np.log(snap_cost(minimum_snap(t, x, *state), t) + 1e-300))
+        return float(np.log(snap_cost(minimum_snap(t, points, *state), t) + 1e-300))
 
-    way = np.linalg.norm(np.diff(x, axis=0), axis=1)
+    way = np.linalg.norm(np.diff(points, axis=0), axis=1)
     start = 0.5 * np.log(np.maximum(way, 1e-3 * max(float(way.max()), 1e-9)))
     first = 1.0
     first = abs(cost(start)) + 1.0

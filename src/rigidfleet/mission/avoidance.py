@@ -21,7 +21,7 @@ _SIGMAS = 3.0
 _LEFT_OUT = 0.02
 
 
-def spare_accelerations(
+def available_accelerations(
     models: Sequence[VehicleModel], gravity: float, disturbances: Disturbances
 ) -> Floats:
     """Acceleration (N,) [m/s^2] that each vehicle has left in any direction, negative if none.
@@ -149,7 +149,7 @@ def avoidance_rules(m: Draft) -> Breaches:
         return
     names = m.agents.vehicle
     models = [model_of_vehicle(m.vehicles[name]) for name in names]
-    left = spare_accelerations(models, m.gravity, d)
+    left = available_accelerations(models, m.gravity, d)
     for name in dict.fromkeys(names):
         i, where = names.index(name), ("vehicles", name, "thrust_limit")
         if math.isinf(left[i]):

@@ -19,7 +19,7 @@ from rigidfleet.math.bernstein import Measure, Measured, greatest_curve_measure
 from rigidfleet.math.piecewise import Piecewise, pad
 from rigidfleet.mission.model import Mission
 from rigidfleet.mission.obstacles import Obstacle, is_ground
-from rigidfleet.solids.polygons import Region, curve_middles
+from rigidfleet.solids.polygons import Region, bezier_curve_middles
 from rigidfleet.solids.records import swept_extent
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -94,7 +94,7 @@ class Boundaries:
             for k, region in areas_judged_by(mission, name)
         ]
 
-    def values(self, quantity: str, r: Floats, v: Floats) -> tuple[Floats, Ints]:
+    def worst_by_area(self, quantity: str, r: Floats, v: Floats) -> tuple[Floats, Ints]:
         """Values (K, N) of a quantity at states (K, N, 3), and to which fence or place each belongs."""
         states = np.concatenate([r, v], axis=2).reshape(-1, 6, 1)
         who = np.tile(np.arange(r.shape[1]), len(r))
@@ -130,11 +130,11 @@ class Boundaries:
     def _nearness_of_falls(self, region: Region, points: Floats, who: Ints) -> Measured:
         """How near people falls from curves (M, 6, P) of agents (M,) go: minus distances [m], see `Measure`."""
         levels = np.linspace(region.ceiling, region.floor, _LEVELS)
-        m, k = curve_middles(points)[..., None], self.k[who][:, None]
+        m, k = bezier_curve_middles(points)[..., None], self.k[who][:, None]
         low, high = points.min(axis=2)[..., None], points.max(axis=2)[..., None]
 
-        def fall_times(x: Floats) -> Floats:
-            height, climb, drag = np.broadcast_arrays(x[:, 2] - levels, x[:, 5], k)
+        def fall_times(states: Floats) -> Floats:
+            height, climb, drag = np.broadcast_arrays(states[:, 2] - levels, states[:, 5], k)
             return falls.fall_time(height, climb, drag, self.wind[2], self.g)
 
         tau = fall_times(m)
@@ -181,18 +181,18 @@ class BoundaryWatch:
         self._waiting: list[tuple[Floats, Floats]] = []
         self._left: Bools | None = None
 
-    def add_steps(self, clock: Floats, points: Floats, left: Bools) -> None:
+    def add_steps(self, clock: Floats, points: Floats, remaining: Bools) -> None:
         """Take steps with starts and lengths (S, 2) [s], and control points (S, N, 6, P) of positions and velocities.
 
-        Agents ``left`` (N,) count.
+        Agents ``remaining`` (N,) count.
         """
         if not (self.every and len(clock)):
             return
-        if self._left is None or (self._left != left).any():
+        if self._left is None or (self._left != remaining).any():
             self.search()
-            self._left = left.copy()
+            self._left = remaining.copy()
         self._waiting.append((clock, points))
-        if sum(len(steps) for steps, _ in self._waiting) * len(left) > _TOGETHER:
+        if sum(len(steps) for steps, _ in self._waiting) * len(remaining) > _TOGETHER:
             self.search()
 
     def add_way(self, way: Piecewise, left: Bools | None = None) -> None:

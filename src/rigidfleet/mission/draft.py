@@ -100,7 +100,7 @@ def draft(
     if not below:  # some agents cross the whole shape
         way = float(np.linalg.norm(np.ptp(np.vstack([slots, start - centre]), axis=0)))
     blend = max(4, blend_time(way))
-    climb, flights = _rest_to_rest_seconds(aloft - centre), _waypoint_durations(aloft, waypoints)
+    climb, flights = _rest_to_rest_seconds(aloft - centre), _rows_and_durations(aloft, waypoints)
     lasts = climb + blend + _SETTLE + sum(time for _, time in flights) + _HOLD
     limit = math.ceil(LIFT * mass * 9.81) if thrust_limit is None else thrust_limit
     extent = json.dumps([float(x) for x in size]) if len(size) > 1 else f"{size[0]:g}"
@@ -164,7 +164,7 @@ def output_step(n: int, lasts: float) -> float:
     return math.ceil(20 * lasts * n / _STORED) / 20
 
 
-def _waypoint_durations(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[tuple[str, int]]:
+def _rows_and_durations(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[tuple[str, int]]:
     """Each waypoint as a list in TOML, and the duration [s] of the way there from a position (3,) [m]."""
     flights = []
     for waypoint in waypoints:

@@ -89,7 +89,7 @@ def inline_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str,
     return data, "".join(digests) + to_toml(data) if digests else text
 
 
-def lines_with_digests(text: str) -> str:
+def digest_lines(text: str) -> str:
     """The lines of a mission's text that tell the digests of files, for a text that is written anew from its data."""
     lines = re.findall(rf"^# .*{_DIGEST}[0-9a-f]{{64}}(?:{_DOUBTS}.*)?$", text, re.MULTILINE)
     return "".join(f"{line}\n" for line in dict.fromkeys(lines))

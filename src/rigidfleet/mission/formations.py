@@ -68,10 +68,10 @@ def formation_rules(m: Draft) -> Breaches:
         path = ("formations", name)
         if (form := m.validate(Formation, data, path)) is not None:
             m.formations[name] = form
-            m.record_breaches(path, _own_formation_rules(m, form, name))
+            m.record_breaches(path, _single_formation_rules(m, form, name))
 
 
-def _own_formation_rules(m: Draft, form: Formation, name: str) -> Breaches:
+def _single_formation_rules(m: Draft, form: Formation, name: str) -> Breaches:
     """A formation has slots or distances for all agents, and nothing without effect."""
     path, n = ("formations", name), m.n
     if n is not None and (form.rest is not None or form.agents is not None):
@@ -261,6 +261,6 @@ def _distance_rules(form: Formation, lengths: Sequence[float], n: int) -> Breach
         yield Breach("distances", problem, "correct the ones above first", None)
     if not violations:
         try:
-            distance_geometry.slots_from_distances(n, edges, lengths)
+            distance_geometry.slots_of_all_distances(n, edges, lengths)
         except ValueError as error:
             yield Breach("distances", str(error), "change them or give shape and size", None)

@@ -26,14 +26,14 @@ from rigidfleet.math.lqr import double_integrator_gains
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission.changes import add_scaled_formations, split_shared_formations
 from rigidfleet.mission.check import check_parts, default_tables
-from rigidfleet.mission.files import lines_with_digests
+from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
 from rigidfleet.mission.phases import latest_end_of_phases
 from rigidfleet.mission.schema import DRAG, Aborting, Contents, Disturbances
 from rigidfleet.mission.text import parse_toml, text_error
 from rigidfleet.mission.vehicles import VehicleModel, model_of_vehicle
-from rigidfleet.solids.distance import height_below
+from rigidfleet.solids.distance import top_of_solids_below
 from rigidfleet.solids.records import Solids, join_solids
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -252,7 +252,7 @@ class Mission(Contents, Shown):
     @property
     def file_digests_text(self) -> str:
         """What its text tells of the files that were read: lines with their digests."""
-        return self._about or lines_with_digests(self._text)
+        return self._about or digest_lines(self._text)
 
     @property
     def origin(self) -> str:
@@ -511,7 +511,7 @@ class Mission(Contents, Shown):
         count, and neither does a box of whose upper side z is more than a metre below: it is beside.
         """
         x, y, z = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in (x, y, z)))
-        return np.maximum(height_below(x, y, z, self.roofs), self.ground)
+        return np.maximum(top_of_solids_below(x, y, z, self.roofs), self.ground)
 
     def is_standing(self, r: Floats) -> Bools:
         """Which vehicles at r (N, 3) [m] stand on what is below them, (N,)."""

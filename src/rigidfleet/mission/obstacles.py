@@ -32,7 +32,7 @@ class Solid(Part):
 
     @property
     @abstractmethod
-    def form(self) -> Form:
+    def solid_at_rest(self) -> Form:
         """The shape, where its keys place it."""
 
     @property
@@ -41,7 +41,7 @@ class Solid(Part):
         return None
 
     @property
-    def path_and_times(self) -> tuple[Any, Any]:
+    def moves_and_times(self) -> tuple[Any, Any]:
         """Displacements (W, 3) [m] and their times (W,) [s]; empty if the obstacle does not move."""
         return (), ()
 
@@ -59,8 +59,8 @@ class Solid(Part):
         ValueError
             The points of a hull lie in a plane.
         """
-        ways, times = self.path_and_times
-        return records.one_solid(self.form, times, ways, self.lifetime)
+        ways, times = self.moves_and_times
+        return records.one_solid(self.solid_at_rest, times, ways, self.lifetime)
 
 
 class Moving(Solid):
@@ -80,7 +80,7 @@ class Moving(Solid):
     )
 
     @property
-    def path_and_times(self) -> tuple[Any, Any]:
+    def moves_and_times(self) -> tuple[Any, Any]:
         """Displacements (W, 3) [m] and their times (W,) [s]."""
         if self.velocity is not None and any(self.velocity):
             return np.outer([0.0, _EVER], self.velocity), np.array([0.0, _EVER])
@@ -101,7 +101,7 @@ class Moving(Solid):
     @property
     def undisplaced_centre(self) -> Any:
         """The centre (3,) [m] that waypoints lead: where the other keys place the obstacle."""
-        return self.form.origin
+        return self.solid_at_rest.origin
 
 
 class Box(Moving):
@@ -117,7 +117,7 @@ class Box(Moving):
     @property
     def box_bounds(self) -> tuple[float, ...] | None:
         """Lowest and highest corner (6,) [m]; None if the box is turned or moves."""
-        if self.is_turned or len(self.path_and_times[1]):
+        if self.is_turned or len(self.moves_and_times[1]):
             return None
         return (*self.min, *self.max)
 
@@ -127,7 +127,7 @@ class Box(Moving):
         return bool(self.roll_deg or self.pitch_deg or self.yaw_deg)
 
     @property
-    def form(self) -> Form:
+    def solid_at_rest(self) -> Form:
         """The box, turned by its angles if it `is_turned`."""
         angles = np.deg2rad([self.roll_deg, self.pitch_deg, self.yaw_deg])
         return records.box(self.min, self.max, dcm_from_euler(angles) if self.is_turned else None)
@@ -146,7 +146,7 @@ class Sphere(Moving):
     radius: values.Length = required_key("radius [m]")
 
     @property
-    def form(self) -> Form:
+    def solid_at_rest(self) -> Form:
         """The ball."""
         return records.ball(self.centre, self.radius)
 
@@ -161,7 +161,7 @@ class Cylinder(Moving):
     radius: values.Length = required_key("radius [m]")
 
     @property
-    def form(self) -> Form:
+    def solid_at_rest(self) -> Form:
         """The cylinder."""
         return records.cylinder(self.ends, self.radius)
 
@@ -175,7 +175,7 @@ class Hull(Moving):
     )
 
     @property
-    def form(self) -> Form:
+    def solid_at_rest(self) -> Form:
         """The hull."""
         return records.hull(self.points)
 
@@ -201,7 +201,7 @@ class Heights(Solid):
     )
 
     @property
-    def form(self) -> Form:
+    def solid_at_rest(self) -> Form:
         """The height map."""
         heights, step = np.array(self.heights), np.full(2, self.spacing)
         wide = self.spacing * (max(heights.shape) - 1)
@@ -236,7 +236,7 @@ KINDS: dict[str, type[Part]] = models_by_kind(Obstacle)
 
 def is_ground(thing: Obstacle) -> bool:
     """Whether an obstacle counts as ground: a ground, and terrain and boxes that are no zones and at rest."""
-    firm = isinstance(thing, Heights | Box) and not thing.zone and not len(thing.path_and_times[1])
+    firm = isinstance(thing, Heights | Box) and not thing.zone and not len(thing.moves_and_times[1])
     return firm or isinstance(thing, Ground)
 
 

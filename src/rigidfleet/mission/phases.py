@@ -183,7 +183,7 @@ def _motion_time_rules(m: Draft, p: Phase, k: int, duration: float | None) -> Br
         yield Breach("travel", problem, "reduce travel or end the phase later", lasts)
 
 
-def _estimate_sample_numbers(m: Draft, n: int) -> int:
+def _estimate_numbers_per_sample(m: Draft, n: int) -> int:
     """About how many numbers a sample of n agents has in a result."""
     about = {"complete": n**2 // 2, "neighbours": 9 * n}
     edges = sum(
@@ -200,7 +200,7 @@ def _sample_count_rules(m: Draft, end: float | None) -> Breaches:
         return
     switches = 2 * len(m.tables("phases"))  # one sample per step, and two at each change of phase
     samples = end / step + switches
-    numbers = _estimate_sample_numbers(m, n)
+    numbers = _estimate_numbers_per_sample(m, n)
     if step > end:
         problem, remedy = f"is longer than the mission, which ends at {end:g} s", "reduce it"
     elif end / step > _MOST_SAMPLES:

@@ -440,7 +440,7 @@ class Formation(Part):
             return shapes.slots(self.shape, self.size, n)
         if self.slots is not None:
             return rigid_body.centred(self.slots)
-        return distance_geometry.slots_from_distances(n, self.edge_array(n), self.distances or ())
+        return distance_geometry.slots_of_all_distances(n, self.edge_array(n), self.distances or ())
 
 
 class Geofence(Part):

@@ -46,7 +46,7 @@ from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg
 from rigidfleet.planning.limits import Limit, limits_of
 from rigidfleet.planning.reference import PhaseState, Pose, copy_with
-from rigidfleet.planning.vehicles import airflow_force
+from rigidfleet.planning.vehicles import drag_and_lift
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Greatest acceleration [m/s^2], jerk [m/s^3] and speed [m/s] of a vehicle on its way home, unless `limits` asks for
@@ -323,7 +323,7 @@ class Aborts:
             if self.lost.any():
                 proved = certificate_of(leg.phase, leg.reference, leg.radius, self.lost)
             if proved is None and len(self.left) > 1:  # no slots are tracked there
-                proved = self._prove_ways_of(make(), self.left)
+                proved = self._prove_ways(make(), self.left)
             least = min(least, proved or least)
         # Its polynomials differ from the plan's ways by less than `CLOSE`.
         return self._step(name, make, least._replace(time=0.0), CLOSE, path=end)
@@ -334,9 +334,9 @@ class Aborts:
         """A step of ways that keep a separation, if they are so much off it [m]."""
         way = make()
         end = way.at(way.time[-1:])[0]
-        return Step(name, make, float(way.time[-1]), end, least, self._gap_loss(way) + off, **how)
+        return Step(name, make, float(way.time[-1]), end, least, self._drag_drift(way) + off, **how)
 
-    def slow_down_step(self, begins: float) -> tuple[Step, str]:
+    def slow_down_step_and_problem(self, begins: float) -> tuple[Step, str]:
         """Slow down along the plan from a time on [s], in the least time that keeps the limits, or fly to its landing.
 
         Where the plan itself is beyond a limit, that counts as the limit.
@@ -349,7 +349,7 @@ class Aborts:
         v = self.plan.states(np.array([begins]), 2)[1, 0, self.left]
         speed = float(np.linalg.norm(v, axis=1).max())
         first = max(_STEEPEST * speed / BRAKING, math.sqrt(_BENT * speed / JERK))
-        time, over = self._least_time_along(
+        time, over = self._least_time_and_ratios(
             first, self.limits, lambda time: _path_clock(begins, time, _SLOWING)
         )
         if begins + 0.5 * time >= self.plan_end and self.mission_lands:
@@ -365,7 +365,7 @@ class Aborts:
             problem = f"the plan itself leads {who} within {max(least, 0.0):.2f} m of each other"
         return step, problem
 
-    def _least_time_along(
+    def _least_time_and_ratios(
         self, first: float, limits: list[Limit], clock: Callable[[float], Piecewise]
     ) -> tuple[float, Floats]:
         """`shortest_time` of a step along the plan by a clock of a time; where the plan exceeds a limit, it counts."""
@@ -386,7 +386,7 @@ class Aborts:
         who, x = self.left, x.swapaxes(0, 1)[:, :, self.left]
         return np.array([(q.values(x, who) / q.most[who]).max() for q in limits])
 
-    def _gap_loss(self, way: Piecewise) -> float:
+    def _drag_drift(self, way: Piecewise) -> float:
         """By how much nearer than on their way two vehicles may be in flight [m].
 
         Drag in proportion to the speed holds vehicles off their ways that fly differently, as tracking answers to it.
@@ -395,9 +395,9 @@ class Aborts:
         if not mission.drag.any() or len(who) < 2:
             return self.off
         v = way.states(np.linspace(0.0, way.time[-1], _LOOKS), 2)[1][:, who]
-        push = airflow_force(mission, np.array(mission.all_disturbances.wind) - v, who)
+        push = drag_and_lift(mission, np.array(mission.all_disturbances.wind) - v, who)
         if mission.tracking.drag_feedforward:
-            push = push - airflow_force(mission, -v, who)
+            push = push - drag_and_lift(mission, -v, who)
         push = push / (mission.fleet.mass[who, None] * mission.tracking_gains[0])
         apart = np.linalg.norm(push - push.mean(axis=1, keepdims=True), axis=2)
         return self.off + 2.0 * _OVERSHOOT * float(apart.max())
@@ -472,9 +472,9 @@ class Aborts:
                 return f"'{thing}' stands in the way {step.name} of agent {left[i] + 1}"
         return ""
 
-    def _prove_ways_of(self, way: Piecewise, who: Ints, first: int | None = None) -> Certificate:
+    def _prove_ways(self, way: Piecewise, who: Ints, with_first: int | None = None) -> Certificate:
         """Certificate of the ways of some vehicles (n,), as `prove_ways`."""
-        least = prove_ways(way.time, way.pieces[:, who], self.radius[who], first)
+        least = prove_ways(way.time, way.pieces[:, who], self.radius[who], with_first)
         return least._replace(agents=tuple(who[list(least.agents)].tolist()))
 
     # -- ways home from rest ------------------------------------------------------------------------------
@@ -501,7 +501,7 @@ class Aborts:
             def backward_clock(duration: float, far: float = far) -> Piecewise:
                 return _path_clock(path, duration, -far / duration * _BLEND)
 
-            time, _ = self._least_time_along(_FASTEST * far, self.home_limits, backward_clock)
+            time, _ = self._least_time_and_ratios(_FASTEST * far, self.home_limits, backward_clock)
             home = self.straight_ways_home(self.plan.at(np.array([path - far]))[0], begin + time)
             if home.way:
                 step = self.step_by_clock("back", backward_clock(time))
@@ -609,7 +609,7 @@ class Aborts:
         if not phase.tracks_slots:
             reason = f"only tracked slots can slow down, and '{phase.name}' tracks none"
             return Abort(ordered, begins, (), Home(reason=reason))
-        step, problem = self.slow_down_step(begins)
+        step, problem = self.slow_down_step_and_problem(begins)
         if self.mission_lands and step.path is not None and step.path > self.plan_end - 1e-6:
             return Abort(ordered, begins, (step,), Home((), "lands as planned"))
         if problem := problem or self.obstruction_in_words(step, begins):
@@ -642,7 +642,7 @@ class Aborts:
                 continue
             make = partial(self._ways_of_all, begins, waits, alone.steps)
             way = make()
-            proved = self._prove_ways_of(way, order, len(who))
+            proved = self._prove_ways(way, order, len(who))
             step = self._step("leave", make, min(proved, plan), 0.0)
             if (apart := proved.separation - step.off) < max(self.need, 1e-6):
                 problem = f"{agent_names(proved.agents)} come within {max(apart, 0.0):.2f} m"

@@ -7,10 +7,10 @@ import numpy as np
 from rigidfleet.kernel import avoidance, fleet
 from rigidfleet.mission import Mission
 from rigidfleet.mission.avoidance import (
+    available_accelerations,
     avoidance_margins,
     lag_coefficients,
     reaction_times,
-    spare_accelerations,
 )
 from rigidfleet.planning.courses import ABOVE
 from rigidfleet.solids.records import join_solids
@@ -33,7 +33,7 @@ def avoidance_in_flight(
     drag = np.where([model.point for model in models], mission.drag / mass, 0.0)
     return avoidance.avoidance_arrays(
         period=flight.every * flight.steps * flight.h,
-        b=spare_accelerations(models, mission.gravity, mission.all_disturbances),
+        b=available_accelerations(models, mission.gravity, mission.all_disturbances),
         lift=limit / mass,
         mass=mass,
         g=mission.gravity,

@@ -54,7 +54,7 @@ class Detour:
         """Rotation vector (3,) [rad]."""
         return att.rotation_vector_from_dcm(self.Q.T)
 
-    def decay(self, k: float = DECAY) -> Floats:
+    def decay_accelerations(self, k: float = DECAY) -> Floats:
         """Second derivatives (7,) of displacement, rotation and scale that bring the deviation back at a rate [1/s]."""
         return np.concatenate(
             [
@@ -63,7 +63,7 @@ class Detour:
             ]
         )  # fmt: skip
 
-    def end_if_small(self, still: bool) -> None:
+    def end_if_small_and_still(self, still: bool) -> None:
         """Take it as ended if it is small; ``still``: nothing else is asked of it."""
         rest = self.scale - [1.0, 0.0, 0.0]
         parts = self.x, self.omega, self.rotation_vector, rest
@@ -71,9 +71,9 @@ class Detour:
             self.x, self.Q, self.omega = np.zeros((3, 3)), np.eye(3), np.zeros((2, 3))
             self.scale = np.array([1.0, 0.0, 0.0])
 
-    def state_after(self, dt: float, accelerations: Floats, h: float) -> Detour:
-        """The deviation after dt [s], if its second derivatives go linearly to those asked for (7,) within h [s]."""
-        share = dt / h
+    def state_after(self, dt: float, accelerations: Floats, ramp_time: float) -> Detour:
+        """The deviation after dt [s], if its second derivatives go linearly to those asked for (7,) in a time [s]."""
+        share = dt / ramp_time
 
         def derivatives_after_dt(x: Floats, end: Floats) -> Floats:
             value, rate, second = x
@@ -111,7 +111,7 @@ def least_norm_feasible(G: Floats, h: Floats) -> Floats | None:
     return -r[:-1] / r[-1]
 
 
-def rigid_motion_rows(normals: Floats, arms: Floats, scale: float) -> Floats:
+def motion_and_growth_rows(normals: Floats, arms: Floats, scale: float) -> Floats:
     """Rows (R, 7) of n . a of points at arms (R, 3) from the body's origin, along unit normals (R, 3)."""
     along = (normals * arms).sum(axis=1, keepdims=True)
     return np.hstack([normals, np.cross(arms, normals), along / scale])

@@ -39,7 +39,7 @@ def regulated_motion(
     """
     phi = att.single_rotation_vector(start.T @ goal.T.T)  # start = goal Exp(phi)
     length = arrival - t0
-    times, responses = _lqr_curves(laws, tracking, length, t_end - arrival)
+    times, responses = _lqr_pieces(laws, tracking, length, t_end - arrival)
     x = *start.r.tolist(), *phi
     v = *start.v.tolist(), *att.single_rotation_vector_rate(*phi, *start.omega.tolist())
     x1, v1 = (*goal.r.tolist(), 0.0, 0.0, 0.0), (*goal.v.tolist(), *goal.omega.tolist())
@@ -52,7 +52,7 @@ def regulated_motion(
 
 # The same in every run of a sweep: three fifths of a run of narrow-passage.
 @lru_cache(256)
-def _lqr_curves(laws: Lqr, tracking: Tracking, length: float, rest: float) -> tuple[Floats, Floats]:
+def _lqr_pieces(laws: Lqr, tracking: Tracking, length: float, rest: float) -> tuple[Floats, Floats]:
     """Knots (n + 1,) [s] of a way and of the rest after it, and quintics (2, 4, n * 6) between them.
 
     For either regulator, and then the tracking gains, they are those from an error in position of 1 at the start, from
@@ -106,7 +106,7 @@ def smooth_motion(
     meets = points, begin, end, *(np.array(at.velocity or zero * np.nan) for at in through)
     times = np.array([0.0, *(at.time or np.nan for at in through), total])
     if np.isnan(times).any():
-        times = splines.least_snap_knots(total, *meets)
+        times = splines.least_snap_knot_times(total, *meets)
     phi = np.stack([pose_turn_from(start, goal.T), np.stack([zero, goal.omega, zero, zero])], 1)
     turn = Piecewise.hermite(times[[0, -1]], phi).with_knots(times).pieces
     cm = splines.minimum_snap(times, *meets)

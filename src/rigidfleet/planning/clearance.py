@@ -37,10 +37,10 @@ def slot_speed_bounds(reference: Reference, motion: Motion, begin: Floats, end: 
     map has no singular value above 1. A slot that blends lies on a straight way, whose ends are its greatest levers.
     """
     c = motion.coefficients
-    speed = _bounds(motion.knots, c[:, None, :3], begin, end)[1][:, 0]
-    turning = _bounds(motion.knots, c[:, None, 3:], begin, end)[1][:, 0]
+    speed = _upper_bounds(motion.knots, c[:, None, :3], begin, end)[1][:, 0]
+    turning = _upper_bounds(motion.knots, c[:, None, 3:], begin, end)[1][:, 0]
     if len(reference.knots):
-        lever, rate = _bounds(reference.knots, reference.ways, begin, end)
+        lever, rate = _upper_bounds(reference.knots, reference.ways, begin, end)
         return speed[:, None] + turning[:, None] * lever + rate
     p0, p1 = reference.p0, reference.p0 + reference.dp
     lever = np.maximum(np.linalg.norm(p0, axis=1), np.linalg.norm(p1, axis=1))
@@ -54,7 +54,7 @@ def slot_speed_bounds(reference: Reference, motion: Motion, begin: Floats, end: 
     return speed[:, None] + turning[:, None] * lever + blending[:, None] * ways
 
 
-def _bounds(knots: Floats, ways: Floats, begin: Floats, end: Floats) -> tuple[Floats, Floats]:
+def _upper_bounds(knots: Floats, ways: Floats, begin: Floats, end: Floats) -> tuple[Floats, Floats]:
     """Upper bounds (L, n) of size and rate of polynomials (K, n, 3, P) over spans, from ``begin`` to ``end`` (L,)."""
     first = piece_index(knots, begin)
     last = np.maximum(piece_index(knots, end, "left"), first)

@@ -272,7 +272,7 @@ def _trajectory_conflict_text(phase: Follow, now: PhaseState) -> str:
 def climb_distances(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     """How far [m] each vehicle (N,) goes up from the pose to hold: to a height, or (down) to just above the ground."""
     (_, goal, slots), n = now.pose_goal_and_slots, mission.n_agents
-    place, ground = goal.r[2] + slots @ goal.T[:, 2], _surface_heights_below(mission, now)
+    place, ground = goal.r[2] + slots @ goal.T[:, 2], _surface_heights_below_goal(mission, now)
     if phase.arrival_height is None:
         up = np.minimum(ground + (ABOVE + mission.fleet.radius) - place, 0.0)
     else:
@@ -281,7 +281,7 @@ def climb_distances(mission: Mission, phase: Vertical, now: PhaseState) -> Float
     return np.where(goes & ~now.lost, up, 0.0)
 
 
-def _surface_heights_below(mission: Mission, now: PhaseState) -> Floats:
+def _surface_heights_below_goal(mission: Mission, now: PhaseState) -> Floats:
     """Height (N,) [m] of what is below each vehicle at the pose to hold; of a lost one, the least of the others'.
 
     Raises
@@ -304,7 +304,7 @@ def height_above_landing(mission: Mission, now: PhaseState) -> float:
     """How far [m] the lowest vehicle is above the height at which a landing ends, at the pose to hold."""
     _, goal, slots = now.pose_goal_and_slots
     below = goal.r[2] + slots @ goal.T[:, 2] - mission.fleet.radius
-    return float(below[~now.lost].min() - _surface_heights_below(mission, now).min()) - ABOVE
+    return float(below[~now.lost].min() - _surface_heights_below_goal(mission, now).min()) - ABOVE
 
 
 def _course_to(

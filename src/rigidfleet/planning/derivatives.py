@@ -85,7 +85,8 @@ def slot_taylor(reference: Reference, body: tuple[Floats, Floats], time: Floats)
     cm, axes = body
     if len(reference.knots):
         return (
-            series.product(way_taylor(reference, time)[: len(cm)], axes, _in_world) + cm[:, :, None]
+            series.product(slot_way_taylor(reference, time)[: len(cm)], axes, _in_world)
+            + cm[:, :, None]
         )
     s = blend_taylor(time, reference.t0, reference.T_b)[: len(cm)]
     if reference.turn.any():
@@ -97,7 +98,7 @@ def slot_taylor(reference: Reference, body: tuple[Floats, Floats], time: Floats)
     return slots + cm[:, :, None]
 
 
-def way_taylor(reference: Reference, time: Floats) -> Floats:
+def slot_way_taylor(reference: Reference, time: Floats) -> Floats:
     """Taylor series (5, N, 3, K) of slots on their ways, body axes, at times (K,) [s]; at rest before and after."""
     ways = Piecewise(reference.knots, reference.ways)
     inside = np.clip(time, ways.time[0], ways.time[-1])
@@ -176,10 +177,10 @@ def yaw_derivatives(
     slots = slot_taylor(reference, body, time)
     if yaw.kind == "along":
         return yaw_along(reference, motion, time, slots, start)[0].transpose(2, 0, 1)
-    return yaw_by_kind(body, slots, yaw).transpose(2, 0, 1)
+    return yaw_derivatives_but_along(body, slots, yaw).transpose(2, 0, 1)
 
 
-def yaw_by_kind(body: tuple[Floats, Floats], slots: Floats, yaw: Yaw) -> Floats:
+def yaw_derivatives_but_along(body: tuple[Floats, Floats], slots: Floats, yaw: Yaw) -> Floats:
     """Yaw with two derivatives (3, N, K) of every kind but "along", see `yaw_derivatives`.
 
     From the `body_taylor` and the `slot_taylor` at the same times.
@@ -216,7 +217,7 @@ def yaw_along(
     on_grid = slot_taylor(reference, body, grid_time)
     if start is None:
         v = on_grid[1, :2, :, 0]
-        from_body = yaw_by_kind(body, on_grid, Yaw())[0, :, 0]
+        from_body = yaw_derivatives_but_along(body, on_grid, Yaw())[0, :, 0]
         start = np.where(np.hypot(*v) > SLOW, np.arctan2(v[1], v[0]), from_body)
     terms = np.ascontiguousarray(_yaw_ode_terms(on_grid)[0].transpose(2, 0, 1))  # (times, 3, N)
     between = terms[len(ends) :]

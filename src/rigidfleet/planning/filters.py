@@ -24,7 +24,7 @@ def gauss_markov(white: Floats, step: float, tau: float) -> Floats:
     """
     x = white * math.sqrt(-math.expm1(-2.0 * step / tau))
     x[0] = white[0]
-    return _first_order_recursion(x, math.exp(-step / tau))
+    return _recursion_in_place(x, math.exp(-step / tau))
 
 
 def dryden_gust(white: Floats, step: float, tau: float) -> Floats:
@@ -43,9 +43,9 @@ def dryden_gust(white: Floats, step: float, tau: float) -> Floats:
     z1, z2 = root * first, low * first
     z2 += rest * second
     z1[0], z2[0] = first[0], 0.5 * (first[0] + second[0])
-    z1 = _first_order_recursion(z1, a)
+    z1 = _recursion_in_place(z1, a)
     z2[1:] += a * s * z1[:-1]
-    z2 = _first_order_recursion(z2, a)
+    z2 = _recursion_in_place(z2, a)
     z1 *= math.sqrt(3.0)
     z2 *= 1.0 - math.sqrt(3.0)
     z1 += z2
@@ -78,7 +78,7 @@ def _incomplete_gamma(n: int, x: float) -> float:
     return tail
 
 
-def _first_order_recursion(x: Floats, a: float) -> Floats:
+def _recursion_in_place(x: Floats, a: float) -> Floats:
     """Solve z_{k+1} = a z_k + x_{k+1} from z_0 = x_0; x and z (K, ...)."""
     from rigidfleet.kernel.engine import native  # loads the compiled kernel
 

@@ -97,13 +97,13 @@ class Change(NamedTuple):
 
 
 def is_clear(
-    space: FreeSpace, a: Floats, b: Floats, path: Path, ways: Floats, radius: Floats, need: float
+    space: FreeSpace, a: Floats, b: Floats, offset_at: Path, ways: Floats, radius: Floats, need: float
 ) -> Bools:  # fmt: skip
     """Whether motions (E,) keep the room ``need`` [m]: from a to b (E, 3) [m], with offsets that follow a path.
 
     ``ways`` (M,) bounds what each ball flies relative to the centre of mass [m].
     """
-    free = space.is_inside(a, b, path, ways, need)
+    free = space.is_inside(a, b, offset_at, ways, need)
     way = np.linalg.norm(b - a, axis=1)[:, None] + ways
     who, length = np.flatnonzero(free), 1.0
     low = np.zeros(len(who))
@@ -111,7 +111,7 @@ def is_clear(
         middle = low + length / 2
         place = a[who] + middle[:, None] * (b - a)[who]
         wanted = need + way[who] * length / 2
-        room = space.clearance_to_obstacles(place[:, None] + path(middle), radius, wanted)
+        room = space.clearance_to_obstacles(place[:, None] + offset_at(middle), radius, wanted)
         free[who[(room < need).any(axis=1)]] = False
         open_ = free[who] & (room < wanted).any(axis=1)
         who, low, length = who[open_], low[open_], length / 2
@@ -247,13 +247,13 @@ class Roadmap:
                 yield a, b, np.full(len(a), change.cost)
         for f in range(1, len(self.lattices)):
             for k, layer in enumerate(self.layers):
-                yield self._links_between_lattices(k, layer, f)
+                yield self._links_to_frame(k, layer, f)
 
-    def _links_between_lattices(self, k: int, layer: Layer, f: int) -> tuple[Ints, Ints, Floats]:
+    def _links_to_frame(self, k: int, layer: Layer, frame: int) -> tuple[Ints, Ints, Floats]:
         """Straight ways of a layer between common places of the world's lattice and the nearest of another frame."""
         from scipy.spatial import KDTree
 
-        one, two = self.lattices[0][k], self.lattices[f][k]
+        one, two = self.lattices[0][k], self.lattices[frame][k]
         a, b = one.common[one.free[one.common]], two.common[two.free[two.common]]
         if not (len(a) and len(b)):
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -263,7 +263,7 @@ class Roadmap:
         still = np.zeros(len(self.radius))
         good = is_clear(self.space, p, q, constant_path(layer), still, self.radius, self.need)
         cost = np.linalg.norm(p - q, axis=1)[good]
-        return a[good] + self.first[0, k], b[good] + self.first[f, k], cost
+        return a[good] + self.first[0, k], b[good] + self.first[frame, k], cost
 
     def node_at(self, place: Floats, layer: int) -> int:
         """The node at a place (3,) of a layer in the world's lattice; common coordinates contain it."""
@@ -294,7 +294,7 @@ class Roadmap:
         """The stops of a way that is straight where that is proved, with changes at stops or half-way between them."""
         each = list(zip(stops.places, stops.layers, strict=True))
         for _ in range(_SHORTER):
-            each = self._move_changes(self._straighten(each))
+            each = self._move_layer_changes(self._straighten(each))
         ends = stops.places[0], stops.places[-1]
         places = [p if any(p is end for end in ends) else np.round(p, 3) for p, _ in each]
         return Stops(places, [k for _, k in each], stops.cost)
@@ -324,7 +324,7 @@ class Roadmap:
             k += 1
         return stops
 
-    def _move_changes(self, stops: list[Stop]) -> list[Stop]:
+    def _move_layer_changes(self, stops: list[Stop]) -> list[Stop]:
         """Changes moved to the stop before or after, or half-way between the two, which saves a detour to them."""
         stops, first = list(stops), 1
         while first < len(stops) - 1:

@@ -16,7 +16,7 @@ from rigidfleet.mission import Mission, Obstacle
 from rigidfleet.mission.changes import scaled_formation_name
 from rigidfleet.mission.kinds import Go
 from rigidfleet.planning.lattice import Change, Path
-from rigidfleet.planning.reference import slot_change
+from rigidfleet.planning.reference import shift_and_rotvec
 from rigidfleet.typing import Floats
 
 #: Roll, pitch and yaw [deg].
@@ -130,7 +130,7 @@ def _shape_change_path_and_ways(
 ) -> tuple[Path, Floats] | None:
     """Offsets and ways of a change of shape, as references blend it; None if agents come too near each other."""
     p, q = one.slots, two.slots
-    dp, turn = slot_change(p, q, mission.fleet.mass, mission.assigned_turn(one.name, two.name))
+    dp, turn = shift_and_rotvec(p, q, mission.fleet.mass, mission.assigned_turn(one.name, two.name))
     if len(p) > 1:
         least = closest_approach(p, p + dp, mission.fleet.radius)[0]
         if least <= 0.0 or least < (mission.limits.separation or 0.0) - _SLACK:

@@ -29,7 +29,7 @@ from rigidfleet.planning.reference import (
     copy_with,
     pose_at,
     reference_kind,
-    slot_change,
+    shift_and_rotvec,
 )
 from rigidfleet.typing import Floats
 
@@ -222,7 +222,7 @@ def depart(mission: Mission, phase: Phase, now: PhaseState) -> Departure:
         return Departure(now, state, frame, target, CONSTANT, p0, np.zeros(p0.shape), np.zeros(3))
     kind = _KINDS[reference_kind(mission, shaping, p0, target)]
     after, turn = (p0, np.eye(3)) if target is None else (target, turn)
-    return Departure(now, state, frame, target, kind, p0, *slot_change(p0, after, left, turn))
+    return Departure(now, state, frame, target, kind, p0, *shift_and_rotvec(p0, after, left, turn))
 
 
 def _attach_frame(

@@ -20,7 +20,7 @@ from rigidfleet.math.bernstein import SIZES
 from rigidfleet.mission import Mission
 from rigidfleet.mission.schema import Limits
 from rigidfleet.planning.derivatives import reference_of_agents, slot_derivatives
-from rigidfleet.planning.vehicles import airflow_force
+from rigidfleet.planning.vehicles import drag_and_lift
 from rigidfleet.typing import Floats, Ints
 
 #: Samples of a phase and of a blend, of a piece, and of a phase of many pieces in all.
@@ -58,11 +58,11 @@ def limits_of(
     mission: Mission,
     limits: Limits | None = None,
     reserve: Floats | None = None,
-    unlimited: Collection[str] = (),
+    kept_if_unlimited: Collection[str] = (),
 ) -> list[Limit]:
     """The limits that a mission sets to its references, or other ``limits`` in place of its own.
 
-    Quantities ``unlimited`` by name are there without a limit, too: it is then infinite.
+    Quantities ``kept_if_unlimited`` by name are there without a limit, too: it is then infinite.
     With ``reserve`` (N,) [s], quantities are the greatest that vehicles reach (`planning.vehicles.tracking_lag_times`).
     """
     limits, n = limits or mission.limits, mission.n_agents
@@ -78,7 +78,7 @@ def limits_of(
 
     def force_per_mass(x: Floats, who: Ints) -> Floats:
         """What a thrust gives per mass [m/s^2], against drag if vehicles leave a reserve."""
-        air = 0.0 if reserve is None else airflow_force(mission, -x[:, 1], who) / mass[who, None]
+        air = 0.0 if reserve is None else drag_and_lift(mission, -x[:, 1], who) / mass[who, None]
         return x[:, 2] + up - air
 
     def tilt_with_overshoot(_: Quantity, x: Floats, who: Ints) -> Floats:
@@ -93,7 +93,7 @@ def limits_of(
         table, _, key = q.key.partition(".")
         most = mission.fleet.thrust_limit if table == "agents" else getattr(limits, key)
         most = np.broadcast_to(np.asarray(np.inf if most is None else most, dtype=float), n)
-        if q.name in unlimited or np.isfinite(most).any():
+        if q.name in kept_if_unlimited or np.isfinite(most).any():
             finite.append(Limit(q, most, partial(ways.get(q.way, motion_with_overshoot), q)))
     return finite
 

@@ -111,7 +111,7 @@ def loss_legs(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg
     # Slots on ways of their own are where they should be only with the body's way.
     if (start.blend is not None and start.formation is None) or _hits_obstacle(mission, legs[0]):
         whole = plan()
-        slow, *_ = Aborts(mission, whole, start.lost).slow_down_step(start.t)
+        slow, *_ = Aborts(mission, whole, start.lost).slow_down_step_and_problem(start.t)
         brake = phases_of(mission, [slow._replace(name="brake (loss)")])
         legs = legs_from(mission, abandonment_state(whole, start), brake)
         now = legs[-1].planned_end_state

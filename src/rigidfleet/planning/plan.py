@@ -165,22 +165,22 @@ class PhasePlan(Leg):
         n, m = len(self.masses), len(self.edges)
         size = 6 * n + m
         size += 0 if self.frame is None else 10 if self.problem.body_formulation else 4
-        velocity = self.velocity_tolerance()
+        velocity = self.velocity_atol()
         return absolute_tolerances(
             self.integrator, size, velocity, self.distances, large=self.is_large
         )
 
-    def velocity_tolerance(self) -> Floats:
+    def velocity_atol(self) -> Floats:
         """Absolute tolerance (N,) of velocities [m/s]."""
         beta = self.problem.law.beta
         return tolerance_of_velocity(
             self.integrator, self.before.r, self.masses, beta, large=self.is_large
         )
 
-    def solver_rtol_and_atol(self) -> tuple[float, float]:
+    def residual_rtol_and_atol(self) -> tuple[float, float]:
         """Relative and absolute [m/s^2] residual of an iterative solve for the multipliers."""
         share = min(max(_RESIDUAL * self.integrator.rtol, _LEAST_RESIDUAL), _MOST_RESIDUAL)
-        return share, _FLOOR * float(self.velocity_tolerance().min())  # over a step of 1 s
+        return share, _FLOOR * float(self.velocity_atol().min())  # over a step of 1 s
 
     def remove_lost_edges(self, lost: Bools, lost_links: Bools) -> Bools:
         """Remove the edges of vehicles ``lost`` (N,) and ``lost_links`` (L,); return which edges (m,) are kept."""
@@ -235,7 +235,7 @@ def plan_phase(
     phase, shaping, now, name = leg.phase, leg.phase.shaping, leg.departure.now, leg.formation
     masses, edges = mission.fleet.mass.copy(), _edges(mission, name)
     method = solvers.choose_method(len(masses), edges, mission.constraint.solver)
-    _refuse_hopeless_phase(mission, phase, leg.start, edges if method == "dense" else edges[:0])
+    _refuse_late_or_huge_phase(mission, phase, leg.start, edges if method == "dense" else edges[:0])
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if shaping is None:
         d1 = now.reference.values_of(edges, lambda: d1)
@@ -302,7 +302,7 @@ def _limit_integrator_step(external: External, motion: Motion, reference: Refere
     return external if longest == most else external._replace(max_step=0.5 * longest)
 
 
-def _refuse_hopeless_phase(mission: Mission, phase: Phase, start: float, edges: Ints) -> None:
+def _refuse_late_or_huge_phase(mission: Mission, phase: Phase, start: float, edges: Ints) -> None:
     """Refuse a phase that is to end before it starts [s], or that would take hours to simulate, for its dense edges."""
     if phase.until is not None and phase.until <= start:
         raise StoppedError(
@@ -355,7 +355,7 @@ def _agree(lengths: Floats, slots: Floats, edges: Ints) -> bool:
     return bool((np.abs(lengths - own) <= _ROUNDED + 1e-12 * own).all())
 
 
-def _constraint_law(mission: Mission, mu: float, *, damped: bool) -> ConstraintLaw:
+def _constraint_law(mission: Mission, solver_damping: float, *, damped: bool) -> ConstraintLaw:
     c = mission.constraint
     pid = c.stabilisation == "pid"
     return ConstraintLaw(
@@ -363,7 +363,7 @@ def _constraint_law(mission: Mission, mu: float, *, damped: bool) -> ConstraintL
         beta=c.beta if pid else 0.0,
         gamma=c.gamma if pid else 0.0,
         solver=SOLVERS[c.solver],
-        mu=mu,
+        mu=solver_damping,
         iterations=c.iterations,
         s0=c.threshold,
         cutoff=c.cutoff,

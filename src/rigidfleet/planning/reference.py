@@ -164,7 +164,7 @@ def reference_kind(
     return "squares" if same_hand else "shape"
 
 
-def slot_change(
+def shift_and_rotvec(
     before: Floats, after: Floats, masses: Floats, turn: Floats | None = None
 ) -> tuple[Floats, Floats]:
     """What a blend adds to the slots, and the rotation vector by which it turns them at the same time.

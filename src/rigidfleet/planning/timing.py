@@ -188,7 +188,7 @@ def _min_time(
             return fastest
     limits = limits_of(mission) if limits is None else limits
 
-    def reached_at(time: float, *, fine: bool = False) -> list[Reached]:
+    def use_for_time(time: float, *, fine: bool = False) -> list[Reached]:
         leg = leg_from(mission, vary(time), departure)
         return use_of_limits(limits, leg.reference, leg.motion, leg.start, leg.end, fine=fine)
 
@@ -197,7 +197,7 @@ def _min_time(
     before = math.inf
     for _ in range(_TRIES):
         # The greatest share of a limit, as a power that falls in proportion to the time of ways from rest to rest.
-        over = max(x.share ** (1 / x.limit.of.order) for x in reached_at(time))
+        over = max(x.share ** (1 / x.limit.of.order) for x in use_for_time(time))
         if time > _STEP / 2 * low > 0.0 and over > _STALLED * before:
             low = time  # a longer time does not help: the state at the start, or a circle, is beyond the limit
             break
@@ -208,8 +208,8 @@ def _min_time(
         guess = time * min(max(over * _NEARLY, 1 / _STEP), _STEP)
         time = max(min(max(guess, low * _NEAR), high / _NEAR), shortest)
     if high == math.inf:
-        return None, max(reached_at(low), key=lambda x: x.share)
-    while (worst := max(reached_at(high, fine=True), key=lambda x: x.share)).share > 1.0 + SLACK:
+        return None, max(use_for_time(low), key=lambda x: x.share)
+    while (worst := max(use_for_time(high, fine=True), key=lambda x: x.share)).share > 1.0 + SLACK:
         high *= 1.001  # between the samples of the grid
     return high, worst
 

@@ -196,10 +196,10 @@ def _descend(control: Floats, duration: float, limits: _Limits, rng: np.random.G
             over = np.sign(d) * np.maximum(np.abs(d) - 0.99, 0.0)
             cost += weight * float((over * over).sum())
             rise = 2.0 * weight * over / most
-            slope -= _difference_adjoint(rise, order)
+            slope -= _negative_difference_adjoint(rise, order)
             if order == 2:
                 cost += _SMOOTH * float((d * d).sum())
-                slope -= _difference_adjoint(2.0 * _SMOOTH * d / most, order)
+                slope -= _negative_difference_adjoint(2.0 * _SMOOTH * d / most, order)
         out = np.maximum(control - limits.high, 0.0) + np.minimum(control - limits.low, 0.0)
         cost += w_box * float((out * out).sum())
         slope += 2.0 * w_box * out
@@ -216,7 +216,7 @@ def _descend(control: Floats, duration: float, limits: _Limits, rng: np.random.G
     return control
 
 
-def _difference_adjoint(rise: Floats, order: int) -> Floats:
+def _negative_difference_adjoint(rise: Floats, order: int) -> Floats:
     """The negative transpose of differences of an order, applied to slopes of them."""
     turned = np.diff(np.pad(rise, ((order, order), (0, 0), (0, 0))), order, axis=0)
     return turned if order == 1 else -turned

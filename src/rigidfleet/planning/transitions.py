@@ -90,7 +90,7 @@ def _expand_transition(
     if phase.transition == "ways":
         report_step(f"looking for ways of the agents in '{phase.name}'")
         return [
-            _add_bent_ways(mission, number, table, phase, before, _allowed_box(mission, state()))
+            _add_bent_ways(mission, number, table, phase, before, _slot_limits(mission, state()))
         ], {}
     stops = _layer_stops(mission, number, phase, before)
     if stops is None:
@@ -181,7 +181,7 @@ def _state_after(mission: Mission, so_far: dict[str, Any], timed: Timed) -> Phas
     return now
 
 
-def _allowed_box(mission: Mission, now: PhaseState | None) -> Floats:
+def _slot_limits(mission: Mission, now: PhaseState | None) -> Floats:
     """Corners (2, 3) [m], about the centre of mass in body axes, between which vehicles fly from a state on.
 
     These are heights above the ground and within the geofence if the formation is level then, and the geofence's sides

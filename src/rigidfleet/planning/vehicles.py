@@ -28,8 +28,8 @@ from rigidfleet.planning.derivatives import (
     slot_derivatives,
     slot_taylor,
     yaw_along,
-    yaw_by_kind,
     yaw_derivatives,
+    yaw_derivatives_but_along,
 )
 from rigidfleet.planning.disturbances import mission_disturbance
 from rigidfleet.planning.virtual_clock import postpone
@@ -128,7 +128,7 @@ def tracking_lag_times(mission: Mission) -> Floats:
     return times
 
 
-def airflow_force(mission: Mission, u: Floats, who: Ints | slice = slice(None)) -> Floats:
+def drag_and_lift(mission: Mission, u: Floats, who: Ints | slice = slice(None)) -> Floats:
     """Drag and lift (..., N, 3) [N] of air that moves at u (..., N, 3) [m/s] past vehicles, level near hover."""
     models = mission.vehicle_models
     if models is None:
@@ -252,14 +252,14 @@ def clocks_of(mission: Mission) -> VehicleClocks:
     if clocks is None:
         return made
 
-    def values_by_vehicle(value: float | tuple[float, ...], kind: int, least: float) -> Floats:
+    def random_values(value: float | tuple[float, ...], stream: int, least_share: float) -> Floats:
         if isinstance(value, tuple):
             return np.array(value, dtype=np.float64)
-        return value * np.random.default_rng((kind, net.seed)).uniform(least, 1.0, n)
+        return value * np.random.default_rng((stream, net.seed)).uniform(least_share, 1.0, n)
 
     return made._replace(
-        late=(values_by_vehicle(clocks.late, _LATE, 0.0) * rate).round().astype(np.int64),
-        drift=1e-6 * values_by_vehicle(clocks.drift, _DRIFT, -1.0),
+        late=(random_values(clocks.late, _LATE, 0.0) * rate).round().astype(np.int64),
+        drift=1e-6 * random_values(clocks.drift, _DRIFT, -1.0),
         gain=clocks.consensus,
         wait=math.inf if clocks.wait is None else clocks.wait,
     )
@@ -415,7 +415,7 @@ def commanded_yaw(mission: Mission) -> Yaw:
     return Yaw(yaw.kind, math.radians(yaw.yaw_deg), yaw.point or (0.0, 0.0, 0.0))
 
 
-def initial_yaw(mission: Mission) -> Floats:
+def initial_yaw_and_rate(mission: Mission) -> Floats:
     """Yaw and its rate (2, N) [rad, rad/s] with which vehicles start."""
     start, frame = np.zeros((2, mission.n_agents)), mission.body_frame
     start[0] = 0.0 if frame is None else math.radians(frame.yaw_deg)
@@ -464,7 +464,7 @@ def slot_taylor_and_yaw(
     slots = slot_taylor(reference, body, time)
     if yaw.kind == "along":
         return slots, *yaw_along(reference, motion, time, slots, turn.start[0])
-    turned = yaw_by_kind(body, slots, yaw)
+    turned = yaw_derivatives_but_along(body, slots, yaw)
     turned[0] += turn.off[0, :, None]
     done = blend_taylor(time, turn.begun, _TURN_TIME)[:3]
     if yaw.kind != "formation":

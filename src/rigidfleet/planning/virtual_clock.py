@@ -77,7 +77,7 @@ class VirtualClock:
             ]
         )  # fmt: skip
 
-    def advance(self, dt: float) -> float:
+    def advance_and_count_delay(self, dt: float) -> float:
         """Run for dt [s]; returns by how much the delay has grown [s]."""
         if self.has_unit_rate:
             return 0.0

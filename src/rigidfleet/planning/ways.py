@@ -150,7 +150,7 @@ class _Search:
             report_step(
                 f"looking for a way of '{self.phase.name}' round obstacles, shapes: {len(shapes)}"
             )
-            roadmap = self._roadmap(shapes, need, more=more)
+            roadmap = self._roadmap(shapes, need, yawed=more)
             stops = roadmap.stops_of_shortest_way((self.begin, 0), (self.end, self._last))
             if stops is not None and (best is None or stops.cost < best[1].cost):
                 best = roadmap, stops
@@ -160,14 +160,14 @@ class _Search:
             raise self._no_way_error(roadmap)
         return best[0], best[0].stops_of_shorter_way(best[1])
 
-    def _roadmap(self, shapes: list[layers.CandidateShape], need: float, *, more: bool) -> Roadmap:
+    def _roadmap(self, shapes: list[layers.CandidateShape], need: float, *, yawed: bool) -> Roadmap:
         frames = layers.lattice_frames(self._near_obstacles_at_rest())
         fence = self.mission.limits.geofence
         box = np.array([[-np.inf] * 3, [np.inf] * 3])
         box = box if fence is None else np.array([fence.min, fence.max]) + [[need], [-need]]
         space = FreeSpace(self._near_obstacles_at_rest(), box)
         roll, pitch, yaw_before = self.start
-        yaws = {yaw_before + yaw for yaw in _YAWS} if more else set()
+        yaws = {yaw_before + yaw for yaw in _YAWS} if yawed else set()
         for shape in shapes:
             yaws |= layers.narrow_yaws(shape.slots, self.start, frames)
         angles = [self.start]
@@ -199,7 +199,9 @@ class _Search:
 
     # -- from nodes to phases --------------------------------------------------------------------------
 
-    def _parts(self, roadmap: Roadmap, stops: Stops) -> Iterator[tuple[str, dict[str, Any], float]]:
+    def _parts_and_lengths(
+        self, roadmap: Roadmap, stops: Stops
+    ) -> Iterator[tuple[str, dict[str, Any], float]]:
         """Name, keys and greatest way [m] of an agent, of each part of a way, which becomes a phase."""
         changes = {frozenset((c.before, c.after)): float(c.ways.max()) for c in roadmap.changes}
         written = self._formation_names_in_file()
@@ -228,7 +230,7 @@ class _Search:
     def _phase_tables(self, roadmap: Roadmap, stops: Stops) -> list[dict[str, Any]]:
         """The phases of a way as tables; times are shared like the roots of the longest ways, or automatic."""
         phase = self.phase
-        parts = list(self._parts(roadmap, stops))
+        parts = list(self._parts_and_lengths(roadmap, stops))
         if not parts:
             parts = [("stay", {"kind": "fly", "position": self.end.tolist()}, 1.0)]
         end = latest_end(phase, self.now.t)
@@ -308,7 +310,7 @@ class _Search:
         """What stands in the way, and how much is missing."""
         mistake = partial(self.mistake, "position", self.phase.position)
         for what, place, layer in (("start", self.begin, 0), ("goal", self.end, self._last)):
-            room, agent, thing = self._tight_agent(roadmap, place, layer)
+            room, agent, thing = self._tightest_room(roadmap, place, layer)
             if room < roadmap.need:
                 problem = (
                     f"its {what} leaves agent {agent + 1} {room:.2f} m of clearance from {thing}, which is less"
@@ -316,7 +318,7 @@ class _Search:
                 )
                 return mistake(problem, "move it, or ask for less clearance")
         least, place, layer = roadmap.widest_way_bottleneck((self.begin, 0), (self.end, self._last))
-        x, (_, _, thing) = roadmap.layers[layer], self._tight_agent(roadmap, place, layer)
+        x, (_, _, thing) = roadmap.layers[layer], self._tightest_room(roadmap, place, layer)
         where = ", ".join(f"{v:z.2f}" for v in place)
         problem = (
             f"no way is found: at the narrowest place of the best one, ({where}) m, '{x.formation}' at yaw"
@@ -328,7 +330,7 @@ class _Search:
         remedy = "allow a slimmer formation (formations, scales), ask for less clearance, or name points on the way"
         return mistake(problem, remedy)
 
-    def _tight_agent(self, roadmap: Roadmap, place: Floats, layer: int) -> tuple[float, int, str]:
+    def _tightest_room(self, roadmap: Roadmap, place: Floats, layer: int) -> tuple[float, int, str]:
         """The least room [m] of an agent at a place, the agent, and what is nearest to it."""
         r, space = place + roadmap.layers[layer].offsets, roadmap.space
         room = space.clearance(r, roadmap.radius)

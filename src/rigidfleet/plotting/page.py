@@ -24,7 +24,7 @@ def _legend_above(ax: Axes, handles: list[Any]) -> None:
     )  # fmt: skip
 
 
-def _draw_attitude_or_error(ax: Axes, result: Result) -> None:
+def _draw_attitude_or_constraint(ax: Axes, result: Result) -> None:
     """Three Euler angles in one axes, dark to light; without an attitude, the constraint error."""
     flown, wanted, _ = curves.flown_and_wanted_euler(result)
     if not np.isfinite(flown).any():
@@ -69,7 +69,7 @@ def summary(result: Result) -> Figure:
         curves.draw_constraint_error(lengths, result)
     if 0 < len(result.edges) <= curves.SINGLE:
         _legend_above(lengths, curves.edge_handles(result))
-    _draw_attitude_or_error(angles, result)
+    _draw_attitude_or_constraint(angles, result)
     curves.draw_thrust_or_distance(thrust, result)
     curves.draw_least(apart, result, "clearance" if result.mission.obstacles else "separation")
     entries = space.trajectory_legend_entries(result, view)

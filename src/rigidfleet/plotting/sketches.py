@@ -87,7 +87,7 @@ def _draw_formation(ax: Axes, result: Result, name: str) -> None:
     if drawn.placed and mission.n_agents > 1 and not mission.formation_colours(name):
         share = (0.3, 0.3, 0.42, 0.5)[distance_geometry.dimension(drawn.p, 1e-3)]
         length = share * float(np.linalg.norm(drawn.p, axis=1).max())
-        _draw_body_axes(ax, drawn.turn.T, length, (drawn.p @ drawn.turn.T)[:, :2])
+        _draw_formation_axes(ax, drawn.turn.T, length, (drawn.p @ drawn.turn.T)[:, :2])
 
 
 class Sketch(NamedTuple):
@@ -153,7 +153,7 @@ def draw_graph(
         ax.axhspan(-room, room, facecolor=st.NIGHT, linewidth=0, zorder=0, gid="night")
     shown = lights or st.agent_colours(n)
     if n > st.MANY:
-        _draw_swarm(ax, p, edges, colours, shown)
+        _draw_many(ax, p, edges, colours, shown)
         return
     for e in np.argsort(p[edges, 2].mean(axis=1)) if len(edges) else []:
         i, j = edges[e]
@@ -191,7 +191,7 @@ def draw_graph(
             )  # fmt: skip
 
 
-def _draw_swarm(ax: Axes, p: Floats, edges: Any, colours: list[str], shown: Sequence[str]) -> None:
+def _draw_many(ax: Axes, p: Floats, edges: Any, edge_hues: list[str], hues: Sequence[str]) -> None:
     """Draw a graph of many agents in the colours shown, with the far parts first and fainter."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgba_array
@@ -202,18 +202,18 @@ def _draw_swarm(ax: Axes, p: Floats, edges: Any, colours: list[str], shown: Sequ
     if len(edges):
         near = depth[edges].mean(axis=1)
         order = np.argsort(near)
-        look = to_rgba_array(colours)
+        look = to_rgba_array(edge_hues)
         look[:, 3] = near
         lines = LineCollection(list(p[edges[order]][:, :, :2]), colors=look[order], linewidths=0.5)
         lines.set_gid("edges")
         ax.add_collection(lines)
     order = np.argsort(p[:, 2])
-    dots = to_rgba_array(list(shown))
+    dots = to_rgba_array(list(hues))
     dots[:, 3] = depth
     ax.scatter(*p[order, :2].T, s=2000 / len(p) + 1, c=dots[order], linewidths=0, zorder=3)
 
 
-def _draw_body_axes(ax: Axes, axes: Floats, length: float, agents: Floats) -> None:
+def _draw_formation_axes(ax: Axes, axes: Floats, length: float, agents: Floats) -> None:
     """Draw body axes from the centre of mass; rows of `axes` (3, 3), the last column towards the viewer.
 
     One that points to the viewer is a ring with a dot, beside the centre, where an agent may be. The names of others

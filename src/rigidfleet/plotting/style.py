@@ -412,7 +412,7 @@ def _name_phases(axes: Sequence[Axes], result: Result) -> None:
     labels, over = [], 0.0
     for ax in axes:
         per_second = 0.8 * ax.bbox.width / float(np.diff(ax.get_xlim())[0])
-        for name, start, end in _phase_spans(ax, result):
+        for name, start, end in _phase_spans_in_view(ax, result):
             labels.append(_label_phase(ax, clean_name(name, 60), start, end, fontsize=8))
             over = max(over, labels[-1].get_window_extent().width - per_second * (end - start))
     if not over:
@@ -438,7 +438,7 @@ def number_phases(axes: Iterable[Axes], result: Result) -> str:
     """
     for ax in axes:
         right = -math.inf
-        for i, (_, start, end) in enumerate(_phase_spans(ax, result)):
+        for i, (_, start, end) in enumerate(_phase_spans_in_view(ax, result)):
             label = _label_phase(ax, str(i + 1), start, end, fontsize=6.5)
             box = label.get_window_extent()
             if box.x0 < right + 0.02 * _DPI:
@@ -455,7 +455,7 @@ def _short_phase_names(result: Result) -> list[str]:
     return [p.kind if p.name == f"{p.kind} {i}" else p.name for i, p in enumerate(result.phases, 1)]
 
 
-def _phase_spans(ax: Axes, result: Result) -> list[tuple[str, float, float]]:
+def _phase_spans_in_view(ax: Axes, result: Result) -> list[tuple[str, float, float]]:
     """Name, start and end [s] of each phase that the axes show."""
     low, high = ax.get_xlim()
     return [

@@ -82,10 +82,10 @@ class AbortsCheck(Shown):
         least, when, i, j = min(each)
         near = f"least {least:.2f} m," if least > 0.0 else "hits"
         text = f"{agent_names([i])} flies on: {near} {agent_names([j])} at {when:.1f} s"
-        count = self._count_endangered(each)
+        count = self._endangered_vehicles(each)
         return text + (f"; {count} would come too near" if count else "")
 
-    def _count_endangered(self, each: list[Worst]) -> int:
+    def _endangered_vehicles(self, each: list[Worst]) -> int:
         """How many vehicles would come within the limit of separation."""
         return sum(x.value < (self.mission.limits.separation or 0.0) for x in each)
 
@@ -101,7 +101,7 @@ class AbortsCheck(Shown):
                     "stops_s": x.begins + x.waits + x.slows, "ends_s": x.rest_time,
                     "way": x.home.way, "reason": x.home.reason, "ways": x.home.number,
                     "separation": _pair_data(x.certificate.separation, x.certificate.time, *x.certificate.agents),
-                    "unheard": _pair_data(*min(each)) if each else None, "endangered": self._count_endangered(each),
+                    "unheard": _pair_data(*min(each)) if each else None, "endangered": self._endangered_vehicles(each),
                 }
                 for x, each in zip(self.aborts, self.unheard, strict=True)
             ],

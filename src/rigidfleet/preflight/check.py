@@ -77,7 +77,7 @@ def check(
         *trajectory.separation_remarks(mission, preflight),
         *trajectory.downwash_remarks(mission, preflight),
         *assignment_remarks(mission, preflight),
-        *trajectory.reference_step_remarks(mission, preflight),
+        *trajectory.step_thrust_remarks(mission, preflight),
         *vehicle_remarks(mission, preflight),
         *avoidance_remarks(mission),
         *trajectory.disturbance_remarks(mission, preflight),

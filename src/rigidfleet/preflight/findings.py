@@ -386,7 +386,7 @@ class Preflight(Shown):
     def describe(self) -> Iterator[tuple[str, str]]:
         """Facts, each with its heading: formations, gains, planned paths. `remarks` are separate."""
         for table in self._tables():
-            heads = [("", "") if table.bare else (x, unit) for x, unit, _ in table.columns[1:]]
+            heads = [("", "") if table.bare else x[:2] for x in table.names_units_words[1:]]
             for heading, *texts in table.cell_texts:
                 cells = zip(heads, texts, strict=True)
                 yield heading, ", ".join(f"{x} {y} {unit}".strip() for (x, unit), y in cells if y)
@@ -585,5 +585,5 @@ def _worst_value_data(name: str, worst: Sequence[Any] | None) -> dict[str, Any] 
     return _values_by_name(f"{name.rpartition('_')[2]}_{unit} time_s who limit_{unit}", worst)
 
 
-def _values_by_name(names: str, values: Sequence[Any] | None) -> dict[str, Any] | None:
-    return None if values is None else dict(zip(names.split(), values, strict=False))
+def _values_by_name(spaced_names: str, values: Sequence[Any] | None) -> dict[str, Any] | None:
+    return None if values is None else dict(zip(spaced_names.split(), values, strict=False))

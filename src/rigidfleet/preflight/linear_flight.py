@@ -147,7 +147,7 @@ class LinearFlight:
         rows = grip[:, :, None] * self._coupling[who] + self._diagonal[who]
         return np.linalg.inv(rows) * grip[:, None]
 
-    def _slips_and_inverses(self, grip: Floats) -> tuple[Ints, Ints, Floats]:
+    def _inverses_of_slipping_vehicles(self, grip: Floats) -> tuple[Ints, Ints, Floats]:
         """Vehicles (K,) in flights (K,) of which an edge slips, and the inverses of their equations."""
         each = np.concatenate([grip, np.ones((1, grip.shape[1]))])[self._rows]
         who, flight = np.nonzero((each < 1.0).any(axis=1))
@@ -171,7 +171,7 @@ class LinearFlight:
         z.orders[:2], z.seen[:], z.estimate[:] = (still, moving), (still, moving), moving
         return x
 
-    def fly(
+    def squares_and_end(
         self,
         x: Floats,
         sent: Floats,
@@ -200,7 +200,7 @@ class LinearFlight:
             integral += tick * (gap if grip is None else gap * (grip > 0.0))
             right = held[_INPUT] - own @ put - 2.0 * law.alpha * along - law.beta**2 * gap
             right -= law.gamma * integral
-            slipping = None if grip is None else self._slips_and_inverses(grip)
+            slipping = None if grip is None else self._inverses_of_slipping_vehicles(grip)
             y, force, rest = np.zeros_like(right), 0.0, []
             for theirs in held[_REST:]:
                 y = self._multipliers(self._mean * (right + theirs) + self._damping * y, slipping)

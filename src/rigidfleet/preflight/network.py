@@ -124,7 +124,7 @@ def growth_rate_at_delay(flight: LinearFlight, delay: int, accuracy: float = _FI
 
     def later(z: Floats, ticks: int, grip: Floats | None = None) -> Floats:
         sent = z[flight.size :].reshape(*messages, -1).copy()
-        _, x = flight.fly(z[: flight.size], sent, ticks, delay, arriving_updates, grip)
+        _, x = flight.squares_and_end(z[: flight.size], sent, ticks, delay, arriving_updates, grip)
         sent = np.roll(sent, -(ticks % delay), axis=0)
         return np.concatenate([x, sent.reshape(-1, x.shape[1])])
 
@@ -156,9 +156,9 @@ def last_stable_delay(flight: LinearFlight) -> int:
     return _last_delay(flight, roughly, roughly, *_FINE) if roughly else 0
 
 
-def _last_delay(flight: LinearFlight, first: int, most: int, accuracy: float, growth: float) -> int:
-    """Last delay in ticks up to ``most`` at which motions grow by less, looked for from ``first`` on."""
-    low, high = 0, first
+def _last_delay(flight: LinearFlight, trial: int, most: int, accuracy: float, growth: float) -> int:
+    """Last delay in ticks up to ``most`` at which motions grow by less, looked for from ``trial`` on."""
+    low, high = 0, trial
     while growth_rate_at_delay(flight, high, accuracy) < growth:
         if high == most:
             return most
@@ -208,7 +208,7 @@ def _simulated_growth(
     x, places = np.zeros((flight.size, columns)), 3 * flight.n
     x[:places] = np.random.default_rng(1).normal(size=(places, columns))
     sent, ticks = np.zeros((depth, *flight.shape, columns)), round(time / flight.radio.tick)
-    squares, _ = flight.fly(x, sent, ticks, flight.radio.delay, arrivals, grip)
+    squares, _ = flight.squares_and_end(x, sent, ticks, flight.radio.delay, arrivals, grip)
     squares = squares.reshape(ticks, *shape).mean(axis=2)
     quarter = ticks // 4
     before, after = squares[quarter : 2 * quarter], squares[-quarter:]

@@ -20,7 +20,7 @@ from rigidfleet.math.margins import constraint_filter_matrix
 from rigidfleet.math.pid import matrix_exponential
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import PlannedPhase
-from rigidfleet.planning.vehicles import airflow_force, pair_jet_speeds
+from rigidfleet.planning.vehicles import drag_and_lift, pair_jet_speeds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
 from rigidfleet.preflight.margins import phase_gains
@@ -76,10 +76,10 @@ def _unmodelled_accelerations(mission: Mission, planned: PlannedPhase) -> Floats
     air = np.array(d.wind)
     if d.downwash and mission.n_agents <= STACKED:
         air = air - pair_jet_speeds(mission, planned.position).sum(axis=2)[..., None] * up
-    force = airflow_force(mission, air - v)
+    force = drag_and_lift(mission, air - v)
     if mission.tracking.drag_feedforward:
-        known = airflow_force(mission, -v)
-        force -= known * [1.0, 1.0, 0.0] + airflow_force(mission, -v * up) * up
+        known = drag_and_lift(mission, -v)
+        force -= known * [1.0, 1.0, 0.0] + drag_and_lift(mission, -v * up) * up
     force -= (mission.true_mass[:, None] - mass) * (planned.acceleration + mission.gravity * up)
     return force / mass
 
@@ -135,11 +135,11 @@ def steady_offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Re
 
 
 def _broken_limits_in_words(
-    mission: Mission, preflight: Preflight, planned: PlannedPhase, off: Floats
+    mission: Mission, preflight: Preflight, planned: PlannedPhase, offsets: Floats
 ) -> dict[str, str]:
     """Topic and words of the limits that a planned phase breaks with offsets (K, N, 3) [m]."""
     leg, phase, limits = planned.leg, planned.leg.phase, mission.limits
-    masses, r, far = mission.fleet.mass, planned.position + off, np.linalg.norm(off, axis=2)
+    masses, r, far = mission.fleet.mass, planned.position + offsets, np.linalg.norm(offsets, axis=2)
     moved = [replace(planned, position=r, path_ends=None)]
     there = Preflight(mission, preflight.formations, preflight.gains, moved)
     remarks = [*separation_remarks(mission, there), *downwash_remarks(mission, there)]
@@ -164,7 +164,7 @@ def _broken_limits_in_words(
             (f"point {n} on the way", int(np.linalg.norm(way - at.position, axis=1).argmin()))
         )
     for place, k in places:
-        by = float(np.linalg.norm(masses @ off[k]) / masses.sum())
+        by = float(np.linalg.norm(masses @ offsets[k]) / masses.sum())
         by = by if leg.planned_end_state.formation else max(by, float(far[k].max()))
         held.append(("waypoint", place, by, WAYPOINT_TOLERANCE["position"]))
     forms, turns = phase.establishing is not None, "attitude" in phase.commanded_at_arrival
@@ -178,7 +178,8 @@ def _broken_limits_in_words(
     if name and (phase.shaping is not None or last) and 1 < len(masses) <= STACKED:
         # To first order: a turn of the whole changes no distance.
         i, j = proximity.all_pairs(len(masses))
-        apart, moved = planned.position[-1, i] - planned.position[-1, j], off[-1, i] - off[-1, j]
+        apart = planned.position[-1, i] - planned.position[-1, j]
+        moved = offsets[-1, i] - offsets[-1, j]
         length = np.linalg.norm(apart, axis=1)
         by = float(np.abs((apart * moved).sum(axis=1) / length).max())
         held.append(("formation", "", by, mission.formations[name].greatest_error(length.min())))

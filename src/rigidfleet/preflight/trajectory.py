@@ -21,7 +21,7 @@ from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.limits import limits_of
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.reference import pose_at
-from rigidfleet.planning.vehicles import airflow_force
+from rigidfleet.planning.vehicles import drag_and_lift
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import DENSE, SLACK, WORST_SHOWN, Disturbed, Preflight, Remark
 from rigidfleet.rigidity import jacobian
@@ -131,7 +131,7 @@ def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             yield Remark("fails" if exact else "note", "downwash", text)
 
 
-def _value_nearest_to_limit(
+def _worst_value_when_who_limit(
     way: list[PlannedPhase], values: list[Floats], limits: Floats
 ) -> tuple[float, float, str, float]:
     """Of values (K, N) of each phase, the one nearest to its limit (N,), or the greatest if there is none.
@@ -146,17 +146,17 @@ def _value_nearest_to_limit(
 
 def find_planned_peaks(mission: Mission, preflight: Preflight) -> None:
     """Find what of each motion is nearest to its limit, at samples; jerk and tilt are those of tracked slots."""
-    for limit in limits_of(mission, unlimited=WORST_SHOWN):
+    for limit in limits_of(mission, kept_if_unlimited=WORST_SHOWN):
         q, way = limit.of, preflight.planned_phases
         if q.order == 3 or q.name == "tilt":
             way = [planned for planned in way if planned.leg.phase.tracks_slots]
         if way:
-            states = (_planned_states(planned, q.order) for planned in way)
+            states = (_planned_states_up_to_order(planned, q.order) for planned in way)
             values = [limit.values(x, np.arange(mission.n_agents)) for x in states]
-            preflight.worst[q.name] = _value_nearest_to_limit(way, values, limit.most)
+            preflight.worst[q.name] = _worst_value_when_who_limit(way, values, limit.most)
 
 
-def _planned_states(planned: PlannedPhase, order: int) -> Floats:
+def _planned_states_up_to_order(planned: PlannedPhase, order: int) -> Floats:
     """Planned positions and their derivatives up to an order, at least the second (K, order + 1, N, 3)."""
     if order == 3:
         return slot_derivatives(*planned.leg.slots_and_motion, planned.time, 4)
@@ -182,8 +182,8 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
         force = true[:, None] * (planned.acceleration + g * up)
         force -= drag[:, None] * (wind - planned.velocity)
         needs.append(np.linalg.norm(force, axis=2) + gusts + noise)
-    most = _value_nearest_to_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
-    steady = airflow_force(mission, np.tile(wind, (len(drag), 1)))
+    most = _worst_value_when_who_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
+    steady = drag_and_lift(mission, np.tile(wind, (len(drag), 1)))
     steady -= ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
     if mission.tracking.integral:
@@ -202,7 +202,7 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
         yield Remark("note", "disturbances", text)
 
 
-def reference_step_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
+def step_thrust_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on the forces at a step of the reference: J M^-1 J^T lambda = -beta^2 c."""
     c, masses = mission.constraint, mission.fleet.mass
     if c.stabilisation == "none":
@@ -307,7 +307,7 @@ def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark
 
 def _broken_limit_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
     """Remarks on speed, acceleration and thrust of samples beyond their limits."""
-    x = _planned_states(planned, 2)
+    x = _planned_states_up_to_order(planned, 2)
     for limit in limits_of(mission):
         q = limit.of
         if q.order > 2 or q.name == "tilt":

@@ -15,9 +15,9 @@ from rigidfleet.mission.vehicles import VehicleModel
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.vehicles import (
-    airflow_force,
     commanded_yaw,
-    initial_yaw,
+    drag_and_lift,
+    initial_yaw_and_rate,
     pair_jet_speeds,
     slot_taylor_and_yaw,
     yaw_turn,
@@ -47,7 +47,7 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
     tracked = [planned for planned in way if planned.leg.phase.tracks_slots]
     if models is None or not tracked or all(model.point for model in models):
         return None
-    setting, angle, needs = commanded_yaw(mission), initial_yaw(mission), []
+    setting, angle, needs = commanded_yaw(mission), initial_yaw_and_rate(mission), []
     for planned in tracked:
         leg, n = planned.leg, mission.n_agents
         count = min(max(_SAMPLES, int((leg.end - leg.start) / _STEP) + 1), _MOST)
@@ -156,7 +156,7 @@ def _jet_remarks(mission: Mission, way: Sequence[PlannedPhase]) -> Iterator[Rema
         flow = pair_jet_speeds(mission, planned.position)
         down = np.zeros((*flow.shape, 3))
         down[..., 2] = flow
-        push = airflow_force(mission, down.swapaxes(1, 2)).swapaxes(1, 2)[..., 2]
+        push = drag_and_lift(mission, down.swapaxes(1, 2)).swapaxes(1, 2)[..., 2]
         share = push / (mission.fleet.mass * mission.gravity)[:, None]
         k, i, j = np.unravel_index(int(share.argmax()), share.shape)
         if share[k, i, j] > worst[0]:

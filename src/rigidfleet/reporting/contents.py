@@ -156,33 +156,33 @@ def _vehicles_table(result: Result) -> FactTable:
     """Extremes of each vehicle; if there are too many, of those with the greatest thrust."""
     n, mission = result.n_agents, result.mission
 
-    def greatest_of_each(values: Floats) -> list[float | None]:
+    def greatest_signed(values: Floats) -> list[float | None]:
         most = np.fmax.reduce(values.reshape(*values.shape[:2], -1), axis=(0, 2), initial=np.nan)
         return [x if math.isfinite(x) else None for x in most.tolist()]
 
-    def greatest_by_name(name: str) -> list[float | None]:
-        return greatest_of_each(samples(result, name).values)
+    def greatest_of_each_agent(name: str) -> list[float | None]:
+        return greatest_signed(samples(result, name).values)
 
     def share_of_limit(values: Floats, limits: Any) -> list[str]:
-        return ["" if x is None else f"{100 * x:.0f} %" for x in greatest_of_each(values / limits)]
+        return ["" if x is None else f"{100 * x:.0f} %" for x in greatest_signed(values / limits)]
 
     z = result.position[..., 2]
-    thrust, nothing = greatest_by_name("thrust"), [None] * n
+    thrust, nothing = greatest_of_each_agent("thrust"), [None] * n
     own, rotors = result.interpolation is None, has_rotors(result)
     columns = {
         "mass [kg]": [f"{m:.4g}" for m in mission.agents.mass] if own else nothing,
         "thrust [N]": thrust if own else nothing,
         "share of limit": share_of_limit(result.thrust[..., None], np.array(mission.agents.thrust_limit)[:, None])
         if np.isfinite(mission.agents.thrust_limit).any() else nothing,
-        "speed [m/s]": greatest_by_name("speed"),
-        "acceleration [m/s²]": greatest_by_name("acceleration"),
-        "lowest [m]": [-x for x in greatest_of_each(-z) if x is not None],
-        "highest [m]": greatest_of_each(z),
+        "speed [m/s]": greatest_of_each_agent("speed"),
+        "acceleration [m/s²]": greatest_of_each_agent("acceleration"),
+        "lowest [m]": [-x for x in greatest_signed(-z) if x is not None],
+        "highest [m]": greatest_signed(z),
         "path length [m]": np.linalg.norm(np.diff(result.position, axis=0), axis=2).sum(axis=0).tolist(),
         "share of rotor limit": share_of_limit(rotor_forces(result), rotor_limit(mission)[..., None])
         if rotors else nothing,
-        "tilt [deg]": greatest_of_each(tilt(result)) if rotors else nothing,
-        "from the slot [m]": greatest_by_name("tracking_error") if rotors else nothing,
+        "tilt [deg]": greatest_signed(tilt(result)) if rotors else nothing,
+        "from the slot [m]": greatest_of_each_agent("tracking_error") if rotors else nothing,
     }  # fmt: skip
     order = np.argsort(-np.nan_to_num(np.array(thrust, dtype=float)))
     shown = np.arange(n) if n <= _VEHICLES else np.sort(order[:_VEHICLES])

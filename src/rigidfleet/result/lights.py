@@ -82,7 +82,7 @@ def angles_facing_formation(result: Result) -> tuple[float, float]:
         points = result.position[k][rgb(colours).any(axis=1)]
         if not (len(points) and np.isfinite(points).all()):
             continue
-        _, wide, thick = _principal_axes(points)[0]
+        _, wide, thick = _principal_extents_and_axes(points)[0]
         if (thin := thick / max(wide, 1e-9)) < best:
             q = result.attitude[k]
             turn = dcm_from_quaternion(q).T if np.isfinite(q).all() else np.eye(3)
@@ -97,7 +97,7 @@ def view_angles(points: Floats, front: Floats | tuple[float, ...] = _FRONT) -> t
     that lies flat is seen from above, y upwards.
     """
     ahead = np.asarray(front, dtype=float)
-    extents, axes = _principal_axes(points)
+    extents, axes = _principal_extents_and_axes(points)
     normal = axes[2]
     if extents[1] <= 1e-3 * extents[0]:
         normal = ahead - ahead @ axes[0] * axes[0]
@@ -116,7 +116,7 @@ def camera_axes(azimuth: float, elevation: float) -> Floats:
     return np.array([right, np.cross(out, right), out])
 
 
-def _principal_axes(points: Floats) -> tuple[Floats, Floats]:
+def _principal_extents_and_axes(points: Floats) -> tuple[Floats, Floats]:
     """Extents (3,) of points (n, 3) along their principal directions, the greatest first, and these (3, 3) as rows."""
     about = np.concatenate([points - points.mean(axis=0), np.zeros((3, 3))])
     return np.linalg.svd(about, full_matrices=False)[1:]

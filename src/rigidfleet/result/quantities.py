@@ -41,9 +41,9 @@ class Samples:
         return np.where(np.isfinite(rank), -rank if self.quantity.at_least else rank, np.nan)
 
 
-def norms(x: Floats, more: Floats | None = None) -> Floats:
-    """Lengths (...) of vectors (..., 3), or of their sums with ``more`` (..., 3)."""
-    squares = (x if more is None else x + more) ** 2
+def norms(x: Floats, addend: Floats | None = None) -> Floats:
+    """Lengths (...) of vectors (..., 3), or of their sums with ``addend`` (..., 3)."""
+    squares = (x if addend is None else x + addend) ** 2
     return np.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
 
 
@@ -129,8 +129,8 @@ def _boundary_distances(result: Result, name: str) -> tuple[Any, ...]:
 
     if not areas_judged_by(result.mission, name):
         return (np.full(result.left.shape, np.nan),)
-    values, number = Boundaries(result.mission).values(name, result.position, result.velocity)
-    return mask_lost(result, values), lambda k, i: (i, int(number[k, i]))
+    values, area = Boundaries(result.mission).worst_by_area(name, result.position, result.velocity)
+    return mask_lost(result, values), lambda k, i: (i, int(area[k, i]))
 
 
 def _tilt(result: Result) -> tuple[Floats, ...]:

@@ -246,10 +246,10 @@ class Result(Shown):
             if value is not None or not VARIABLES[name].optional:
                 self._set_array(name, value, sizes)
         if not later:  # what a flight of this process has made is right
-            self._check_arrays(sizes)
+            self._check_array_values(sizes)
         self._sizes = sizes
 
-    def _check_arrays(self, sizes: dict[str, int]) -> None:
+    def _check_array_values(self, sizes: dict[str, int]) -> None:
         """Check values: they come from somewhere else."""
         values = self.__dict__
         if sizes["time"] == 0 or sizes["agent"] == 0:

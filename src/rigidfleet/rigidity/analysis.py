@@ -14,7 +14,7 @@ from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.rigidity.framework import Flex, Framework, localised_flexes
-from rigidfleet.rigidity.order import StressEnergy, blocking_stress, deform_by_finite_flex
+from rigidfleet.rigidity.order import StressEnergy, blocking_stress, flexed_points_and_second_order
 from rigidfleet.typing import Floats, Ints
 
 
@@ -157,7 +157,7 @@ def analyse(
     motions = localised_flexes(frame)
     to_world = axes[:space]
     flexes = tuple(Flex(agents, motion @ to_world) for agents, motion in motions)
-    rigidity_class, reason, stress, bent = classify_rigidity(frame, within)
+    rigidity_class, reason, stress, bent = class_reason_stress_and_shape(frame, within)
     return Rigidity(
         agents=n,
         edges=e,
@@ -242,7 +242,7 @@ def _least_singular_value(frame: Framework, masses: ArrayLike | None) -> float:
     return float(np.linalg.svd(weighted, compute_uv=False)[frame.rank - 1])
 
 
-def classify_rigidity(
+def class_reason_stress_and_shape(
     frame: Framework, within: Rigidity | None = None
 ) -> tuple[RigidityClass, str, Floats | None, Floats | None]:
     """Class, reason, blocking stress, deformed shape."""
@@ -267,7 +267,7 @@ def classify_rigidity(
     if stress is not None:
         reason = f"{free} to first order; a self-stress blocks all of them"
         return RigidityClass.PRESTRESS_STABLE, reason, stress, None
-    bent, goes_on = deform_by_finite_flex(StressEnergy(frame, frame.flexes @ open_flexes))
+    bent, goes_on = flexed_points_and_second_order(StressEnergy(frame, frame.flexes @ open_flexes))
     if bent is not None:
         reason = "a finite motion that keeps all distances was found and followed"
         return RigidityClass.FLEXIBLE, reason, None, bent

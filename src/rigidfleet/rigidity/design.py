@@ -94,7 +94,7 @@ def design(
     if wanted >= len(near):
         return near
     rows = rows[length <= reach]
-    meshes = [np.arange(len(near)), *_delaunay_and_hull_edges(flat, near)]
+    meshes = [np.arange(len(near)), *_delaunay_hull_edge_indices(flat, near)]
     starts = [_add_rows(rows, _keep_best_rows(rows, some, wanted), wanted) for some in meshes]
     chosen = max(starts, key=lambda some: _least_eigenvalue(rows[some]))
     rng = np.random.default_rng(seed)
@@ -177,7 +177,7 @@ def _assert_reach_holds_shape(rows: Floats, length: Floats, reach: float, rank: 
     )
 
 
-def _delaunay_and_hull_edges(flat: Floats, near: Ints) -> list[Ints]:
+def _delaunay_hull_edge_indices(flat: Floats, near: Ints) -> list[Ints]:
     """The edges, as indices into `near`, of Delaunay's triangulation and of the convex hull of points (N, d)."""
     from scipy.spatial import ConvexHull, Delaunay, QhullError
 

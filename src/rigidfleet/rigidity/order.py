@@ -142,7 +142,7 @@ def _blocking_stress_or_proof(energy: StressEnergy) -> tuple[Floats | None, Floa
     return None, vector[:, value > 1e-3], proven
 
 
-def deform_by_finite_flex(energy: StressEnergy) -> tuple[Floats | None, bool]:
+def flexed_points_and_second_order(energy: StressEnergy) -> tuple[Floats | None, bool]:
     """The framework (N, d) deformed by a finite motion that keeps all lengths; None if none is found.
 
     Flexes that extend to second order are searched near those that move few agents and near random ones. Each is

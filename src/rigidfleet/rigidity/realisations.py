@@ -13,7 +13,7 @@ from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.rigidity.analysis import (
     RigidityClass,
     as_framework,
-    classify_rigidity,
+    class_reason_stress_and_shape,
     flatten_points,
 )
 from rigidfleet.rigidity.framework import Framework
@@ -166,7 +166,7 @@ def realisations(
         begin = align_points(at, drawn) @ axes[:dimension].T
         end = deform_to_lengths(begin, e, length, _REACHED * size)
     last = None if end is None else groups.add(end, 0)
-    first = groups.flex_families(e)
+    first = groups.bending_family_of_each_shape(e)
     counts = np.bincount(first, groups.counts).astype(int).tolist()
     shapes = {k: _realisation(groups.shapes[k], p, e, counts[k], size, axes) for k in set(first)}
     rank = {Kind.SAME: 0, Kind.MIRRORED: 1}
@@ -197,7 +197,7 @@ class _Groups:
         self.counts.append(count)
         return len(self.shapes) - 1
 
-    def flex_families(self, edges: Ints) -> list[int]:
+    def bending_family_of_each_shape(self, edges: Ints) -> list[int]:
         """Of each shape, the first one into which it bends while the edges (m, 2) keep their lengths; or itself."""
         frames = [Framework(q, edges) for q in self.shapes]
         bend = [k for k, frame in enumerate(frames) if frame.flexes.size]
@@ -230,7 +230,7 @@ def _realisation(
         kind = Kind.COINCIDENT if closest <= _ALIKE * size else Kind.FOLDED
     frame = Framework(q, e)
     rigid = frame.flexes.shape[1] == 0
-    bends = not rigid and classify_rigidity(frame)[0] is RigidityClass.FLEXIBLE
+    bends = not rigid and class_reason_stress_and_shape(frame)[0] is RigidityClass.FLEXIBLE
     return Realisation(kind, q @ axes[: q.shape[1]], starts, deviation, closest, rigid, bends)
 
 

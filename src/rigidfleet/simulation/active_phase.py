@@ -111,7 +111,7 @@ class ActivePhase:
         return self.integration.t
 
     @property
-    def is_over(self) -> bool:
+    def is_at_latest_end(self) -> bool:
         """Whether the phase has reached its latest end."""
         return self.t >= self.plan.t_end
 

@@ -89,7 +89,7 @@ def _refuse_expanded_phase(phase: Phase) -> None:
         raise MissionError([Finding("begin()", key, getattr(phase, key), problem, remedy)])
 
 
-def check_formation_exists(mission: Mission, phase: Phase) -> None:
+def check_phase_can_begin(mission: Mission, phase: Phase) -> None:
     """See that a phase is one, and that the mission has its formation.
 
     Raises

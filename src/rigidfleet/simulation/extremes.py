@@ -150,7 +150,7 @@ class CurveWatch:
     def deepest_contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far; None if there was none."""
         contacts = [
-            x for x in (self._extremum(records.FLYING), self._stay_clearance()) if x is not None
+            x for x in (self._extremum(records.FLYING), self._landing_clearance()) if x is not None
         ]
         deepest = min(contacts, key=lambda x: x.value, default=None)
         return deepest if deepest is not None and deepest.value < -_TOUCH else None
@@ -172,9 +172,9 @@ class CurveWatch:
                 self._watch_step(problem, work, state, *part)
             return
         self.monitor.search_distances(problem, state, first, steps)
-        self._find_contacts(problem, work, state, range(first, steps))
+        self._find_first_contacts(problem, work, state, range(first, steps))
 
-    def _find_contacts(
+    def _find_first_contacts(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, step_indices: range
     ) -> None:
         """Find the first contact of each kind in some steps of the trail, if there has been none before.
@@ -247,13 +247,13 @@ class CurveWatch:
         extremes: dict[str, Extremum | None] = dict(self.touched)
         if self.solids is not None or len(self.boxes):
             extremes |= {name: self._extremum(k) for name, k in _OF_FLIGHT.items()}
-            extremes["clearance_end"] = self._stay_clearance()
+            extremes["clearance_end"] = self._landing_clearance()
         for name, x in extremes.items():
             if x is not None:
                 last = [p for p in phases if p.t_start <= x.time] or phases
                 last[-1].extremes[name] = x
 
-    def _stay_clearance(self) -> Extremum | None:
+    def _landing_clearance(self) -> Extremum | None:
         """The least clearance of an agent that has stayed near since, as it may be landing; None if there is none."""
         near = self.low[:, 0]
         if math.isfinite(near.min()):
@@ -294,7 +294,7 @@ class CurveWatch:
         """
         trail = records.Trail(clock, points, state.trail.gauge[:0], state.trail.start)
         alone = state._replace(trail=trail)
-        self.monitor.bound_distance_changes(problem, alone)
+        self.monitor.write_first_step_change_bounds(problem, alone)
         moved = self.monitor.monitor.moves.copy()
         if not self.stacks:
             moved[1] = 0.0
@@ -308,7 +308,7 @@ class CurveWatch:
                 return
         self.moved += moved
         self.monitor.search_distances(problem, alone, 0, 1)
-        self._find_contacts(problem, work, alone, range(1))
+        self._find_first_contacts(problem, work, alone, range(1))
 
     def _list_near_pairs(self, problem: Problem, y: Floats, moves: float) -> None:
         """List the pairs that are near each other, or one below the other, at a state (n,).
@@ -348,9 +348,9 @@ class CurveWatch:
             self.columns = np.ascontiguousarray(np.sort(columns, axis=1))
         self._watch_listed_pairs(spare)
 
-    def _watch_listed_pairs(self, spare: float) -> None:
-        """Monitor the listed pairs; no others matter until distances have changed by ``spare`` [m]."""
-        self.spare, self.moved[:] = spare, 0.0
+    def _watch_listed_pairs(self, change_until_renewal: float) -> None:
+        """Monitor the listed pairs; no others matter until distances have changed by ``change_until_renewal`` [m]."""
+        self.spare, self.moved[:] = change_until_renewal, 0.0
         self._replace_monitor_arrays(pairs=self.pairs, columns=self.columns)
 
     def _replace_monitor_arrays(self, **arrays: Any) -> None:
@@ -416,7 +416,7 @@ class Extremes(CurveWatch):
         self._list_all_pairs()
         self.size = None  # other vehicles are monitored from now on
 
-    def monitor_steps(
+    def search_trail_for_extremes(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
     ) -> None:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
@@ -445,7 +445,7 @@ class Extremes(CurveWatch):
         self._taking = self._thread.submit(self._monitor_steps_in_thread, problem, work, taken)
 
     def _monitor_steps_in_thread(self, *arguments: Any) -> None:
-        self.monitor_steps(*arguments, last=False)
+        self.search_trail_for_extremes(*arguments, last=False)
         packing.forget_last_packed()  # the phase may be over before this thread packs others
 
     def wait_for_steps(self) -> None:

@@ -29,7 +29,7 @@ from rigidfleet.planning.reference import PhaseState, Pose, copy_with
 from rigidfleet.planning.timing import complete_times, timed_leg
 from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase
-from rigidfleet.simulation.as_flown import check_formation_exists, mission_as_flown, phase_of_table
+from rigidfleet.simulation.as_flown import check_phase_can_begin, mission_as_flown, phase_of_table
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
     Controller,
@@ -379,7 +379,7 @@ class Flight:
                 self.mission, self._phases_begun[:flown], self.phases[:flown], phase
             )
         else:
-            check_formation_exists(self.mission, phase)
+            check_phase_can_begin(self.mission, phase)
         self._leave_phase(changed=True)
         if self.mission.on_loss == "continue" or not self._is_from_route(phase):
             self._state_now.blend = None
@@ -448,7 +448,7 @@ class Flight:
         if duration is not None and not duration > 0.0:
             raise ValueError(f"the duration must be positive [s], not {duration!r}")
         plan = active.plan
-        stop = min(math.inf if duration is None else active.t + duration, self._loss_time())
+        stop = min(math.inf if duration is None else active.t + duration, self._aborts_at())
         active.integration.stop = stop
         t_end, settle = min(stop, plan.t_end), plan.phase.settle
         try:
@@ -469,9 +469,9 @@ class Flight:
     def end_phase_if_over(self) -> bool:
         """End the phase under way if it is over; return whether it goes on, as `advance` does."""
         active = self.under_way()
-        plan, settle, loss = active.plan, active.plan.phase.settle, self._loss_time()
+        plan, settle, loss = active.plan, active.plan.phase.settle, self._aborts_at()
         self.phases[-1].t_end = active.t
-        if active.has_settled or active.is_over:
+        if active.has_settled or active.is_at_latest_end:
             settled = active.has_settled
             self._leave_phase()
             if settle is not None and not settled:
@@ -652,7 +652,7 @@ class Flight:
             raise FlightError(f"no phase is under way: {why}")
         return self._active
 
-    def _loss_time(self) -> float:
+    def _aborts_at(self) -> float:
         """Time [s] of the loss that ends the phase under way; infinity if none does.
 
         Phases begun by hand go on: who began them decides.
@@ -703,7 +703,7 @@ class Flight:
             self._following -= self._is_from_route(self._phases_begun[-1])
             del self.phases[-1], self._phases_begun[-1], self._plans[-1:]
             return
-        if not (active.has_settled or active.is_over or abandoned):
+        if not (active.has_settled or active.is_at_latest_end or abandoned):
             self._cut.add(len(self.phases) - 1)
         active.search_extremes()
         at, record = active.integration, self.phases[-1]
@@ -729,7 +729,7 @@ class Flight:
         if changed and record.target is not None and record.target["time"] > record.t_end:
             record.target = None
         if not abandoned and (
-            active.has_settled or active.is_over or active.t >= active.plan.arrival
+            active.has_settled or active.is_at_latest_end or active.t >= active.plan.arrival
         ):
             record.stay = active.plan.end_state_record(active.t)
 

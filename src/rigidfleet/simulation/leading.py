@@ -23,8 +23,8 @@ from rigidfleet.planning.body_layer import (
     NEAR,
     Detour,
     greatest_point_acceleration,
+    motion_and_growth_rows,
     nearest_accelerations,
-    rigid_motion_rows,
     rows_bounding_scale,
 )
 from rigidfleet.planning.derivatives import body_taylor, slot_derivatives, slot_taylor
@@ -127,7 +127,9 @@ class Leader:
             *(self._rate_and_bandwidth(t, a) if acts and self.settings.clock else (1.0, np.inf))
         )
         accelerations = (
-            self._deviation_accels(t, a) if acts and self.settings.body else self.deviation.decay()
+            self._deviation_accels(t, a)
+            if acts and self.settings.body
+            else self.deviation.decay_accelerations()
         )
         if self.clock.has_unit_rate and self.deviation.is_zero and not accelerations.any():
             self.now = None
@@ -138,12 +140,12 @@ class Leader:
         self.leads = True
         self.now = LeaderState(t, copy.copy(self.clock), self.deviation)
         problem = self._detour_problem(t, h, accelerations)
-        lost = self.clock.advance(h)
+        lost = self.clock.advance_and_count_delay(h)
         if lost > 0.0:
             self.waited = t if self.waited is None else self.waited
             self._delay_events(end, lost)
         self.deviation = self.deviation.state_after(h, accelerations, h)
-        self.deviation.end_if_small(still=self.calm)
+        self.deviation.end_if_small_and_still(still=self.calm)
         if not self.deviation.is_zero:
             self.steering += h
             self.steered = t if self.steered is None else self.steered
@@ -300,18 +302,18 @@ class Leader:
 
     def _deviation_accels(self, t: float, a: AvoidanceArrays) -> Floats:
         """Second derivatives (7,) of the deviation to take: those of its decay, changed as barriers need."""
-        accelerations, self.calm = self.deviation.decay(), True
+        accelerations, self.calm = self.deviation.decay_accelerations(), True
         sight = a.sight
         moving = np.flatnonzero((sight.moves == 1) & (sight.known == KNOWN))
         if not len(moving) and self.deviation.is_zero:
             return accelerations
-        r, v, rise, arms = self._slot_motion_and_arms(t)
+        r, v, rise, arms = self._slot_states_and_arms(t)
         z = self.deviation.scale[0]
         limit = _STEERING * float(a.b.min())
         cones = (self._moving_obstacle_barriers(o, r, v, rise, a) for o in moving)
         rows, needed, who = self._barrier_rows(cones, arms, limit)
         if len(rows):
-            accelerations = self.deviation.decay(NEAR)
+            accelerations = self.deviation.decay_accelerations(NEAR)
         short = needed - rows @ accelerations
         if not (len(short) and short.max() > 0.0) and self.deviation.is_zero:
             return accelerations
@@ -348,7 +350,7 @@ class Leader:
         d = np.linalg.norm(plan.slots[i] - plan.slots[j], axis=1)
         return np.allclose(d, plan.distances, rtol=0.0, atol=1e-6)
 
-    def _slot_motion_and_arms(self, t: float) -> tuple[Floats, Floats, Floats, Floats]:
+    def _slot_states_and_arms(self, t: float) -> tuple[Floats, Floats, Floats, Floats]:
         """Slots (N, 3), velocities, accelerations without those of the deviation, and arms from the body's origin."""
         tau = np.array([t - self.clock.delay])
         cm, axes = body_taylor(self.problem.motion, tau, 3)
@@ -379,7 +381,7 @@ class Leader:
         parts = [(np.zeros((0, 7)), np.zeros(0), np.zeros(0, dtype=int))]
         for normal, needed in barriers:
             some = np.flatnonzero(needed > -limit)
-            rows = rigid_motion_rows(normal[some], arms[some], self.deviation.scale[0])
+            rows = motion_and_growth_rows(normal[some], arms[some], self.deviation.scale[0])
             parts.append((rows, needed[some], some))
         rows, needed, who = (np.concatenate(each) for each in zip(*parts, strict=True))
         return rows, needed, who

@@ -114,7 +114,7 @@ class PointPropagator:
             return
         work = at.workspace if at.solver is None else at.solver.thread_solver.workspace
         if last or not self.aside:
-            at.extremes.monitor_steps(self.flown, work, at.state, last=last)
+            at.extremes.search_trail_for_extremes(self.flown, work, at.state, last=last)
         else:
             at.extremes.send_steps(self.flown, work, at.state)
 

@@ -95,7 +95,7 @@ class Unevaluated(NamedTuple):
         return self.packed.of
 
     @property
-    def motion(self) -> tuple[Floats, Floats]:
+    def r_and_v(self) -> tuple[Floats, Floats]:
         """Positions and velocities (K, N, 3) of agents, world axes; they may be views of the states."""
         n, m = len(self.problem.vehicles.m), len(self.problem.graph.edges)
         both = self.y[:, : 6 * n].reshape(-1, 2, n, 3)
@@ -201,7 +201,7 @@ def assemble_result(
     worst = [phase.extremes for phase in phases]
     names = *RECORDED, *(("disturbance_force",) if airy else ()), *(SEEN if noisy else ())
     recorded = partial(_forces_and_references, mission, pieces, time, flown)
-    states = [p.source.motion for p in pieces if isinstance(p.source, Unevaluated)]
+    states = [p.source.r_and_v for p in pieces if isinstance(p.source, Unevaluated)]
     later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = []
     if len(states) == len(pieces):
         r, v = zip(*states, strict=True)
@@ -214,7 +214,7 @@ def assemble_result(
         now |= closeness_arrays(mission, worst, r, time)
     later += [
         (LATER, partial(_slot_references, mission, [(p.time, p.followed) for p in pieces], tau)),
-        (("singular_value",), partial(_singular_values, r, [p.edges for p in pieces])),
+        (("singular_value",), partial(_least_singular_value, r, [p.edges for p in pieces])),
         (("mission_text",), partial(mission_text_field, mission)),
     ]
     return Result(
@@ -324,7 +324,7 @@ def closeness_arrays(
         left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
     r = np.concatenate(places)
     close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
-    _lower_closeness(worst, time, close)
+    _lower_closeness_to_extremes(worst, time, close)
     arrays = close.separation, close.pair, close.clearance, close.agent, close.obstacle
     return dict(zip(CLOSE, arrays, strict=True))
 
@@ -348,7 +348,7 @@ def _slot_references(
             off, rate = own[..., :2].mean(axis=1).T
             assert turn is not None  # vehicles fly
             angles.append(
-                _yaw_of_turn(reference, motion, np.maximum(times + off, turn.begun), turned, turn)
+                _yaw_and_rate(reference, motion, np.maximum(times + off, turn.begun), turned, turn)
             )
             angles[-1][:, 1] *= rate[:, None]
             continue
@@ -364,7 +364,7 @@ def _slot_references(
                 continue
             states.append(slot_derivatives(reference, motion, time, 4)[:, 1:])
             if turn is not None:
-                angles.append(_yaw_of_turn(reference, motion, time, turned, turn))
+                angles.append(_yaw_and_rate(reference, motion, time, turned, turn))
                 continue
             # From the sample before, which may be one of an earlier piece.
             begin = np.clip(until, motion.knots[0], time[0]) if last is not None else time[0]
@@ -383,7 +383,7 @@ def _slot_references(
     return dict(zip(LATER, values, strict=True))
 
 
-def _yaw_of_turn(
+def _yaw_and_rate(
     reference: Reference, motion: Motion, time: Floats, yaw: Yaw, turn: YawTurn
 ) -> Floats:
     """Yaw and its rate (K, 2, N) asked of vehicles that turn into it from the yaw they had."""
@@ -406,7 +406,7 @@ def _concatenate_samples(pieces: Sequence[Samples]) -> Samples:
     return type(pieces[0])(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
 
 
-def _lower_closeness(
+def _lower_closeness_to_extremes(
     worst: Sequence[dict[str, Extremum]], time: Floats, close: proximity.Closeness
 ) -> None:
     """Enter extremes between samples at the sample after each."""
@@ -483,7 +483,7 @@ def _edge_columns(some: Ints, edges: Ints) -> Ints | slice:
     return order[np.searchsorted(keys[order], some[:, 0] * key + some[:, 1])]
 
 
-def _singular_values(places: Sequence[Floats], edges: Sequence[Ints]) -> dict[str, Floats]:
+def _least_singular_value(places: Sequence[Floats], edges: Sequence[Ints]) -> dict[str, Floats]:
     """Smallest non-zero singular value of J (K,); NaN if the formation is too large to compute it.
 
     ``places`` (K, N, 3) and ``edges`` are those of each piece. In formations of some tens of agents it is computed at

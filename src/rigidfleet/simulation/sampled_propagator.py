@@ -12,7 +12,7 @@ from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.clock_records import OFF, PACE, RATE, WORST
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
-from rigidfleet.kernel.mail import CLOCK, Links, Mail, give_edges_to_links
+from rigidfleet.kernel.mail import CLOCK, Links, Mail, write_edges_of_links
 from rigidfleet.kernel.problem import ITERATED, Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
@@ -22,7 +22,7 @@ from rigidfleet.planning.derivatives import slots_by_own_clocks
 from rigidfleet.planning.vehicles import (
     TickTables,
     gilbert_transitions,
-    initial_yaw,
+    initial_yaw_and_rate,
     sampled_flight,
     yaw_turn_from,
 )
@@ -70,7 +70,7 @@ class FleetState:
         self.tables = TickTables(mission, self.flight)
         self.avoidance = avoidance_in_flight(mission, self.flight)
         start = mission.fleet
-        self.yaw = initial_yaw(mission)  # asked of each vehicle at the last switch, and its rate
+        self.yaw = initial_yaw_and_rate(mission)  # asked at the last switch, and its rate
         yaw = float(self.yaw[0, 0])
         self.S = fleet.hover_states(self.flight.vehicles, start.position, start.velocity, yaw)
         self.state: fleet.SampledState | None = None  # of the phase before
@@ -149,7 +149,7 @@ class SampledPropagator:
             begun = renewed
         # Edges that end within a phase are those of what is lost.
         lose = self.first_tick is not None
-        give_edges_to_links(self.flight.network, begun.mail, plan.edges, integral, lose=lose)
+        write_edges_of_links(self.flight.network, begun.mail, plan.edges, integral, lose=lose)
         trail = at.state.trail
         self.sampled = fleet_state.state = begun._replace(
             trail=trail._replace(gauge=trail.gauge[:, :0])

@@ -41,7 +41,7 @@ def workspace_and_solver(
         order = None if steps is None else ordering.order_of_steps(steps, plan.problem.graph.edges)
     axes = plan.problem.has_frame or plan.problem.law.k_def > 0.0
     dissect = partial(solvers.agent_dissection_order, points, edges)
-    solver = large_solver(plan.problem, Setup(order, dissect, *plan.solver_rtol_and_atol(), axes))
+    solver = large_solver(plan.problem, Setup(order, dissect, *plan.residual_rtol_and_atol(), axes))
     plan.problem = problem_with_solver(solver, plan.problem)
     return solver.workspace, solver
 
@@ -80,16 +80,16 @@ def first_step(plan: PhasePlan, work: Workspace, state: records.IntegratorState)
     t, y = float(state.clock[records.TIME]), state.y
     scale = plan.tolerances + state.rtol * np.abs(y)
 
-    def scaled_rms(x: Floats) -> float:
+    def rms_in_tolerances(x: Floats) -> float:
         return float(np.sqrt(np.mean((x / scale) ** 2)))
 
     longest = plan.t_end - plan.start
     slope, later = np.empty_like(y), np.empty_like(y)
     native.closed_loop(t, y, slope, problem, work)
-    first = scaled_rms(slope)
-    h = min(0.01 * scaled_rms(y) / max(first, 1e-300), longest)
+    first = rms_in_tolerances(slope)
+    h = min(0.01 * rms_in_tolerances(y) / max(first, 1e-300), longest)
     native.closed_loop(t + h, y + h * slope, later, problem, work)
-    steepest = max(first, scaled_rms(later - slope) / h)
+    steepest = max(first, rms_in_tolerances(later - slope) / h)
     if not 0.0 < steepest < math.inf:
         return float(state.clock[records.NEXT_STEP])
     return min(100.0 * h, (0.01 / steepest) ** 0.2, longest)

@@ -247,7 +247,7 @@ def result_of_curve(
     curve: Piecewise,
     interpolation: str,
     *,
-    names: Sequence[str] = (),
+    agents: Sequence[str] = (),
     spans: Sequence[Sequence[float]] = (),
     since: float = 0.0,
     **judged: Any,
@@ -257,7 +257,7 @@ def result_of_curve(
     Parameters
     ----------
     interpolation : what the curves are, in words
-    names : of the vehicles, where they come from
+    agents : their names, where these come from
     spans : from when to when [s] each vehicle is there; empty: all always are
     since : time of another clock from which times count [s]; no clock of obstacles that move, unless it is 0
     judged : see `judging_mission`
@@ -295,10 +295,10 @@ def result_of_curve(
     record.extremes.update(watch.end_phase())
     watch.add_extremes_to_phases([record])
     record.extremes.update(fastest)
-    at, state, yaws = _sample_motion_and_yaw(curve, parts)
+    at, state, yaws = _sample_times_states_and_yaw(curve, parts)
     if powers < 3:  # lines turn at once at samples
         state[2:] = np.nan
-    facts = {"interpolation": interpolation, "names": list(names), "spans": spans, "clock": zero}
+    facts = {"interpolation": interpolation, "names": list(agents), "spans": spans, "clock": zero}
     r, v, a, j = state
     turned = np.nan_to_num(yaws, copy=False)
     known: dict[str, Any] = {
@@ -333,7 +333,7 @@ def result_of_trajectories(read: Trajectories, **judged: Any) -> Result:
     ends = knots[np.searchsorted(knots, [curve.time[[0, -1]] - 2.0 * SAME for curve in curves])]
     spans = ends.tolist() if read.away and np.ptp(ends, axis=0).any() else ()
     result = result_of_curve(
-        stack_ways(curves), read.assumed, names=read.names, spans=spans, since=read.since, **judged
+        stack_ways(curves), read.assumed, agents=read.names, spans=spans, since=read.since, **judged
     )
     result.statistics |= {"notes": list(read.notes), "read": list(read.read)}
     return result
@@ -371,7 +371,7 @@ def _refuse_jumps(curve: Piecewise) -> None:
         )
 
 
-def _sample_motion_and_yaw(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats]:
+def _sample_times_states_and_yaw(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats]:
     """Times (K,) [s], position to jerk (4, K, N, 3), and yaw and its rate (2, K, N), at ends of equal parts of pieces.
 
     Where states jump, there are two samples. Where the rate of yaw jumps, it is the mean.
@@ -439,7 +439,7 @@ def _watch_positions(
     knots = refine_knots(way.time, grid, 1e-6)
     k = piece_index(way.time, 0.5 * (knots[:-1] + knots[1:]))
     share = np.diff(knots) / np.diff(way.time)[k]
-    knots = _split_intervals(knots, np.ceil(_count_parts(way)[k] * share - 1e-9).astype(np.int64))
+    knots = _split_intervals(knots, np.ceil(_parts_a_piece(way)[k] * share - 1e-9).astype(np.int64))
     together = max(1, _TOGETHER // (30 * way.pieces.shape[1]))
     here = presence(0.5 * (knots[:-1] + knots[1:]), spans, way.pieces.shape[1] if spans else 1)
     change = np.flatnonzero((here[1:] != here[:-1]).any(axis=1)) + 1
@@ -456,7 +456,7 @@ def _watch_positions(
         watch.monitor_curves(clock, records.FROM_KNOTS @ points)
 
 
-def _count_parts(way: Piecewise) -> Ints:
+def _parts_a_piece(way: Piecewise) -> Ints:
     """Into how many parts each piece (K, N, 3, P) is cut, to be within `_CLOSE` of curves of fourth degree.
 
     About any place of a piece of width h, power p has a coefficient of at most sum_j C(j, p) |c_j| h^(j - p). What is

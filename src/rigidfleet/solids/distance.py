@@ -40,7 +40,7 @@ def zero_like(x: Numbers) -> Any:
     return np.zeros_like(x)
 
 
-def choose(test: Numbers, these: Any, others: Any) -> Any:
+def choose_four(test: Numbers, these: Any, others: Any) -> Any:
     """Four numbers where the test holds, four others elsewhere."""
     a, b, c, d = these
     i, j, k, m = others
@@ -136,7 +136,7 @@ def facet_cross_product(t: Any) -> Any:
     return f * r - g * q, g * p - e * r, e * q - f * p
 
 
-def vector_from_triangle(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
+def triangle_vector_and_square(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
     """Vector from the nearest point of a triangle (3, 3) to the point, and its squared length."""
     a, b, c, n = t[0], t[1], t[2], facet_cross_product(t)
     area = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
@@ -146,13 +146,13 @@ def vector_from_triangle(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
         u, v, w = vector_from_segment(x, y, z, t[m], t[(m + 1) % 3])
         d = u * u + v * v + w * w
         nearer = d < best
-        i, j, k, best = choose(nearer, (u, v, w, d), (i, j, k, best))
+        i, j, k, best = choose_four(nearer, (u, v, w, d), (i, j, k, best))
     if area > 0.0:
         over = edge_side(x, y, z, a, b, n) >= 0.0
         over = over & (edge_side(x, y, z, b, c, n) >= 0.0) & (edge_side(x, y, z, c, a, n) >= 0.0)
         height = ((x - a[0]) * n[0] + (y - a[1]) * n[1] + (z - a[2]) * n[2]) / area
         straight = (height * n[0], height * n[1], height * n[2], height * height * area)
-        i, j, k, best = choose(over, straight, (i, j, k, best))
+        i, j, k, best = choose_four(over, straight, (i, j, k, best))
     return i, j, k, best
 
 
@@ -175,9 +175,9 @@ def vector_from_solid_surface(x: Numbers, y: Numbers, z: Numbers, b: int, solids
             node = solids.after[node]
             continue
         for m in range(solids.leaf[node, 0], solids.leaf[node, 1]):
-            u, v, w, d = vector_from_triangle(x, y, z, solids.triangles[m])
+            u, v, w, d = triangle_vector_and_square(x, y, z, solids.triangles[m])
             nearer = d < best
-            i, j, k, best = choose(nearer, (u, v, w, d), (i, j, k, best))
+            i, j, k, best = choose_four(nearer, (u, v, w, d), (i, j, k, best))
         node += 1
     return i, j, k, best
 
@@ -242,7 +242,7 @@ def outward_normal(x: Numbers, y: Numbers, z: Numbers, b: int, solids: Any) -> A
     away = np.sqrt(squared)
     away = where(is_inside(x, y, z, b, solids), -away, away)
     known = squared > 0.0
-    i, j, k, away = choose(known, (i, j, k, away), (0.0, 0.0, 0.0, 1.0))
+    i, j, k, away = choose_four(known, (i, j, k, away), (0.0, 0.0, 0.0, 1.0))
     return i / away, j / away, k / away
 
 
@@ -321,7 +321,7 @@ def height_range(x: Numbers, y: Numbers, b: int, solids: Any) -> Any:
     return low, top
 
 
-def height_below(x: Numbers, y: Numbers, z: Numbers, solids: Any) -> Numbers:
+def top_of_solids_below(x: Numbers, y: Numbers, z: Numbers, solids: Any) -> Numbers:
     """Height [m] of the highest of all solids, boxes and height maps at rest, below points; minus infinity: none."""
     height = x * 0.0 - math.inf
     for b in range(solids.kind.shape[0]):
@@ -333,8 +333,8 @@ def height_below(x: Numbers, y: Numbers, z: Numbers, solids: Any) -> Numbers:
 
 #: The functions that the kernel compiles, each after those that it calls.
 ELEMENTWISE = (
-    choose, box_distance, box_normal, cylinder_distance, cylinder_normal,
-    vector_from_segment, edge_side, facet_cross_product, vector_from_triangle, point_on_height_map,
+    choose_four, box_distance, box_normal, cylinder_distance, cylinder_normal,
+    vector_from_segment, edge_side, facet_cross_product, triangle_vector_and_square, point_on_height_map,
     vector_from_solid_surface, is_inside, signed_distance, outward_normal, solid_displacement, is_solid_present,
-    local_point, is_solid_below, height_range, height_below,
+    local_point, is_solid_below, height_range, top_of_solids_below,
 )  # fmt: skip

@@ -64,7 +64,7 @@ def _revolve(profile: Floats) -> Outline:
     rings = np.empty((len(profile), _SIDES + 1, 3))
     rings[..., :2], rings[..., 2] = profile[:, None, :1] * circle, profile[:, 1:]
     triangles = triangles_of_squares(rings[:-1, :-1], rings[:-1, 1:], rings[1:, 1:], rings[1:, :-1])
-    size = np.linalg.norm(records.normals_of(triangles), axis=1)
+    size = np.linalg.norm(records.double_area_normals(triangles), axis=1)
     triangles = triangles[size > 1e-12 * max(float(size.max()), 1e-300)]
     if len(profile) == 4:  # a cylinder: its rims, and a few lines along it
         kept = rings[1:3]
@@ -78,7 +78,7 @@ def _revolve(profile: Floats) -> Outline:
 
 def _creases(triangles: Floats) -> Floats:
     """Edges (L, 2, 3) between faces that do not lie in one plane."""
-    normal = records.normals_of(triangles)
+    normal = records.double_area_normals(triangles)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     sides: dict[tuple[tuple[float, ...], ...], list[int]] = {}
     for t, points in enumerate(triangles.tolist()):
@@ -93,7 +93,7 @@ def _height_map_outline(solid: Solids) -> Outline:
     z, size = solid.heights.reshape(solid.grid[0]), solid.size[0]
     x, y = (np.linspace(0.0, size[3 + k], n) for k, n in enumerate(z.shape))
     top = np.stack([*np.meshgrid(x, y, indexing="ij"), z], axis=-1)
-    faces = solid.triangles[records.normals_of(solid.triangles)[:, 2] >= 0.0]  # without the bottom
+    faces = solid.triangles[records.double_area_normals(solid.triangles)[:, 2] >= 0.0]  # no bottom
     faces[..., 2] = np.maximum(faces[..., 2], z.min())
     pick = [np.unique(np.linspace(0, n - 1, min(n, 13)).round().astype(int)) for n in z.shape]
     rows = [*top[pick[0]], *top[:, pick[1]].swapaxes(0, 1)]

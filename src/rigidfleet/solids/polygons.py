@@ -43,7 +43,7 @@ class Region(NamedTuple):
         """Signed distance (M,) [m] of points (M, 2) from the area as seen from above: negative inside."""
         some = max(1, _TOGETHER // len(self.edges))
         parts = np.split(x, range(some, len(x), some))
-        return np.concatenate([self._distance(self._edge_offsets(part), part) for part in parts])
+        return np.concatenate([self._distance(self._edge_vectors(part), part) for part in parts])
 
     def curve_depths_and_bounds(self, points: Floats, *, outside: bool) -> tuple[Floats, Floats]:
         """By how much curves are inside (or ``outside``) at their middles (M,) [m], and an upper bound (M,) all along.
@@ -52,7 +52,7 @@ class Region(NamedTuple):
         least as far as the tangents at the middle say, since the distance from an edge is convex; and on the other side
         no farther than its farthest control point.
         """
-        c, low, high = curve_middles(points), self.floor, self.ceiling
+        c, low, high = bezier_curve_middles(points), self.floor, self.ceiling
         across, bound = np.empty(len(c)), np.empty(len(c))
         some = max(1, _TOGETHER // (len(self.edges) * points.shape[2]))
         for k in range(0, len(c), some):
@@ -66,7 +66,7 @@ class Region(NamedTuple):
 
     def _depth(self, points: Floats, middles: Floats, *, outside: bool) -> tuple[Floats, Floats]:
         """`curve_depths_and_bounds` as seen from above, of control points (M, 2, P) with middles (M, 2)."""
-        off = self._edge_offsets(middles)
+        off = self._edge_vectors(middles)
         apart = np.linalg.norm(off, axis=2)
         now = self._distance(off, middles) * (1.0 if outside else -1.0)
         spread = points - middles[:, :, None]
@@ -77,12 +77,12 @@ class Region(NamedTuple):
         bound[kept] = np.minimum(bound[kept], -(apart[kept] + tangents.min(axis=2)).min(axis=1))
         rest = np.flatnonzero((now >= 0.0) | (reach >= -now))
         ends = np.moveaxis(points[rest], 2, 1)
-        far = np.linalg.norm(self._edge_offsets(ends.reshape(-1, 2)), axis=2)
+        far = np.linalg.norm(self._edge_vectors(ends.reshape(-1, 2)), axis=2)
         far = far.reshape(len(rest), ends.shape[1], len(self.edges)).max(axis=1).min(axis=1)
         bound[rest] = np.minimum(bound[rest], far)
         return now, bound
 
-    def _edge_offsets(self, x: Floats) -> Floats:
+    def _edge_vectors(self, x: Floats) -> Floats:
         """Vectors (M, E, 2) to points (M, 2) from the nearest point of each edge."""
         begin, along = self.edges[:, 0], self.edges[:, 1] - self.edges[:, 0]
         off = x[:, None] - begin
@@ -90,8 +90,8 @@ class Region(NamedTuple):
         share = np.clip((off * along).sum(axis=2) / squares, 0.0, 1.0)
         return off - share[..., None] * along
 
-    def _distance(self, from_edges: Floats, x: Floats) -> Floats:
-        least = np.sqrt((from_edges * from_edges).sum(axis=2).min(axis=1))
+    def _distance(self, edge_vectors: Floats, x: Floats) -> Floats:
+        least = np.sqrt((edge_vectors * edge_vectors).sum(axis=2).min(axis=1))
         return np.where(self.covers(x), -least, least)
 
     def covers(self, x: Floats) -> Bools:
@@ -108,7 +108,7 @@ def prism_distance(across: Floats, above: Floats) -> Floats:
     return outside + np.minimum(np.maximum(across, above), 0.0)
 
 
-def curve_middles(points: Floats) -> Floats:
+def bezier_curve_middles(points: Floats) -> Floats:
     """Places (M, C) in the middle of curves with control points (M, C, P)."""
     weights = np.ones(1)
     for _ in range(points.shape[2] - 1):

@@ -120,7 +120,7 @@ def hull(points: ArrayLike) -> Form:
     except QhullError as error:
         raise ValueError("the points lie in a plane") from error
     corners = about[convex.simplices]  # (T, 3, 3), the order of corners as Qhull happens to give it
-    inwards = np.einsum("ta,ta->t", normals_of(corners), convex.equations[:, :3]) < 0
+    inwards = np.einsum("ta,ta->t", double_area_normals(corners), convex.equations[:, :3]) < 0
     corners[inwards] = corners[inwards][:, [0, 2, 1]]
     low, high = about.min(axis=0), about.max(axis=0)
     return Form(HULL, origin, _UPRIGHT, [*low, *high], triangles=corners)
@@ -150,7 +150,7 @@ def height_map(corner: ArrayLike, spacing: ArrayLike, heights: ArrayLike, base: 
     return Form(HEIGHTS, origin, _UPRIGHT, size, triangles=np.concatenate(faces), heights=z)
 
 
-def normals_of(triangles: Floats) -> Floats:
+def double_area_normals(triangles: Floats) -> Floats:
     """Normals (T, 3) of triangles (T, 3, 3), anticlockwise from their ends, twice as long as the areas are large."""
     return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 

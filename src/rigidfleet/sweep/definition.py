@@ -416,7 +416,7 @@ def apply_value(
         return round(new) if integral and math.isfinite(new) else new
 
     def new_value(there: Any) -> Any:
-        return keypaths.map_nested(there, new_number) if is_number(value) else value
+        return keypaths.map_nested_lists(there, new_number) if is_number(value) else value
 
     keypaths.replace_value(document, whole, column.keys, new_value)
 
@@ -502,7 +502,7 @@ class _SweepDraft:
             if (why := why_unfit_for_establish(self.mission)) is not None:
                 self.add(("evaluate",), why, _WHOLE, "final")
         if self.mission is not None:
-            self._check_new_keys(self.mission)
+            self._check_values_of_new_keys(self.mission)
         if header is not None and header.law_key_and_name[1]:
             self._check_law_import(*header.law_key_and_name, header)
         if "rate" in self.data and not self.data.get("controller"):
@@ -529,7 +529,7 @@ class _SweepDraft:
         variation = None if model is None else self.collector.validate(model, entry, where)
         if variation is None or len(self.collector.findings) > before:
             return None
-        if problem := variation.find_invalid_key():
+        if problem := variation.key_problem_and_remedy():
             key, *words = problem
             self.add((*where, key), *words, getattr(variation, key))
             return None
@@ -576,7 +576,7 @@ class _SweepDraft:
                 continue
             self.add(where, problem, remedy, path)
 
-    def _check_new_keys(self, mission: Mission) -> None:
+    def _check_values_of_new_keys(self, mission: Mission) -> None:
         """Check that the mission accepts values for the keys that it does not have, all of them together."""
         document = mission.to_dict()
         for _, column in self.lacked:

@@ -298,7 +298,7 @@ class Show:
         # A show that is moved as a whole changes no distance between its vehicles.
         if fault.kind in SETUP and len(fault.who) == self.n and not self.bounded:
             return {}, "", ""
-        result, every = self.flight_near_fault(fault)
+        result, every = self.flight_of_vehicles_near_fault(fault)
         verdict = assess(result)
         failed = [check for check in verdict.checks if not check.passed]
         worst = {c.check: c.worst for c in verdict.checks if c.judged and c.check in METRICS}
@@ -311,18 +311,18 @@ class Show:
         words = _AGENTS.sub(renumber_in_fleet, failed[0].message) if failed else ""
         return worst, ", ".join(dict.fromkeys(check.check for check in failed)), words
 
-    def flight_near_fault(self, fault: GeometricFault) -> tuple[Result, Ints]:
+    def flight_of_vehicles_near_fault(self, fault: GeometricFault) -> tuple[Result, Ints]:
         """The flight of the vehicles of a fault and of all that may come near them, and which (M,) these are."""
         from rigidfleet.simulation.trajectories import result_of_curve
 
         who = fault.who
         again = np.isin(np.arange(self.n), who)
-        way, knots = self.way_with_fault(fault), self.curve.time
+        way, knots = self.ways_of_faulty_vehicles(fault), self.curve.time
         if not np.array_equal(knots, way.time):
             knots = common_knots([self.curve, way])
         way = way.with_knots(knots, stays=True)
         if fault.kind not in SETUP or not again.all():
-            again |= self._may_be_nearest(who, _Chords.of(way), knots)
+            again |= self._possibly_nearest_vehicles(who, _Chords.of(way), knots)
         every = np.flatnonzero(again)
         curve = self._ways_of(every).with_knots(knots, stays=True)
         powers = max(x.pieces.shape[-1] for x in (curve, way))
@@ -336,7 +336,7 @@ class Show:
         mission = Mission.from_plain(data, "drill")
         return result_of_curve(Piecewise(knots, pieces), self.how, mission=mission), every
 
-    def way_with_fault(self, fault: GeometricFault) -> Piecewise:
+    def ways_of_faulty_vehicles(self, fault: GeometricFault) -> Piecewise:
         """The ways (K, S, 4, P) that vehicles (S,) fly by a fault, on knots of their own."""
         kind, size, who, stream = fault
         pads, flown, turn, by = self.curve.pieces[0, :, :2, 0], self._ways_of(who), np.eye(2), 0.0
@@ -364,7 +364,7 @@ class Show:
         pieces[:, :, :2, 0] += by
         return Piecewise(flown.time, pieces)
 
-    def _may_be_nearest(self, who: Ints, own: _Chords, knots: Floats) -> Bools:
+    def _possibly_nearest_vehicles(self, who: Ints, own: _Chords, knots: Floats) -> Bools:
         """Which vehicles (N,) may be the nearest to one of those (S,) that fly by other chords, or hit it.
 
         If distances count by height, these are all that may come nearer than a limit.

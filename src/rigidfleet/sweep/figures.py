@@ -96,7 +96,7 @@ def plot(
         "map": partial(map_over_two, over=over, metric=metric),
     }
     if table.sweep.drill is not None:
-        draw = {"drill": failure_share_figure, "worst": worst_run_maps}
+        draw = {"drill": drill_failure_figure, "worst": worst_runs_from_above}
     files = []
     for name, drawn in draw.items():
         with st.apply_style(), st.figure_options(titles=titles):
@@ -141,7 +141,7 @@ def success_over_runs(table: Table) -> Figure | None:
     return fig
 
 
-def failure_share_figure(table: Table) -> Figure | None:
+def drill_failure_figure(table: Table) -> Figure | None:
     """Share of the runs of a drill that fail, over the magnitudes of each fault."""
     cases = failure_rates(table)
     if not cases:
@@ -167,7 +167,7 @@ def failure_share_figure(table: Table) -> Figure | None:
     return fig
 
 
-def worst_run_maps(table: Table) -> Figure | None:
+def worst_runs_from_above(table: Table) -> Figure | None:
     """Of each fault that fails, the worst run from above: whom it concerns when it fails, and their ways until then."""
     failed = [case for case in failure_rates(table) if case.worst]
     worst = {

@@ -47,7 +47,7 @@ def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     begun = perf_counter()
     values = [sweep.values(run) for run in runs]
     r, v = start_states(sweep, values)
-    refused = _invalid_runs(sweep, runs, r, v)
+    refused = _runs_of_invalid_missions(sweep, runs, r, v)
     out = list(refused)
     r[out], v[out] = sweep.mission.agents.position, sweep.mission.agents.velocity
     ensemble = establish(sweep.mission, r, v)
@@ -73,7 +73,7 @@ def start_states(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats,
     agents, count = sweep.mission.agents, len(values)
     own = {"position": agents.position, "velocity": agents.velocity}
     states = {name: np.tile(np.array(x, dtype=float), (count, 1, 1)) for name, x in own.items()}
-    with np.errstate(over="ignore", invalid="ignore"):  # `_invalid_runs` has them
+    with np.errstate(over="ignore", invalid="ignore"):  # `_runs_of_invalid_missions` has them
         for column, drawn in zip(sweep.columns, np.array(values, dtype=float).T, strict=True):
             _, name, *inner = column.keys
             place = states[str(name)][(slice(None), *map(int, inner))]
@@ -82,7 +82,7 @@ def start_states(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats,
     return states["position"], states["velocity"]
 
 
-def _invalid_runs(
+def _runs_of_invalid_missions(
     sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats
 ) -> dict[int, tuple[str, str]]:
     """Reason and detail of runs with an invalid mission, by index. Only doubtful missions are checked in full."""

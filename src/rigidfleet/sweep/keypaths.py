@@ -90,9 +90,9 @@ def flatten_lists(value: Any) -> list[Any]:
     return [x for v in value for x in flatten_lists(v)] if isinstance(value, list) else [value]
 
 
-def map_nested(value: Any, function: Callable[[Any], Any]) -> Any:
+def map_nested_lists(value: Any, apply: Callable[[Any], Any]) -> Any:
     """Apply a function to all entries of nested lists."""
-    return [map_nested(v, function) for v in value] if isinstance(value, list) else function(value)
+    return [map_nested_lists(v, apply) for v in value] if isinstance(value, list) else apply(value)
 
 
 def description_of(mission: Mission, keys: Keys) -> str:

@@ -66,7 +66,7 @@ def flight_of_fault(sweep: Sweep, run: int) -> tuple[Result, Ints]:
     if sweep.values(run)[0] in faults.FLOWN:
         return simulate(sweep.mission_of(run)), np.arange(sweep.mission.n_agents)
     show, fault = _drilled_show_and_fault(sweep, run)
-    return show.flight_near_fault(fault)
+    return show.flight_of_vehicles_near_fault(fault)
 
 
 def _fly_group(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:

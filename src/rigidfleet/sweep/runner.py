@@ -130,7 +130,7 @@ def fly(
                     deaths = 1 if flight.flown > before else deaths + 1
                     if deaths >= _DEATHS or not isinstance(error.__cause__, BrokenExecutor):
                         raise
-        _log.info(f"{flight.store_text()}; done")
+        _log.info(f"{flight.saved_text()}; done")
     return read(folder)
 
 
@@ -146,7 +146,7 @@ class _Sweeping:
         self.flown, self.failed, self.workers = 0, 0, 1
         self.begun = self.changed = perf_counter()
         self.pace = 0.0  # [s] a run
-        _log.info(f"{self.store_text()}; begun")
+        _log.info(f"{self.saved_text()}; begun")
         self.report_progress(1)
 
     def fly_in_this_process(self, *, until_worth: bool) -> None:
@@ -191,7 +191,7 @@ class _Sweeping:
         finally:
             for future, runs in flying.items():
                 future.cancel()
-                _log.warning(f"{self.store_text()}; lost in flight: {len(runs)}, from {runs[0]} on")
+                _log.warning(f"{self.saved_text()}; lost in flight: {len(runs)}, from {runs[0]} on")
             lost = {run // GROUP for runs in (*flying.values(), taken) for run in runs}
             self.missing.extendleft(sorted(lost, reverse=True))
 
@@ -209,13 +209,13 @@ class _Sweeping:
         self.flown += len(rows)
         self.failed += sum(not row.passed for row in rows)
         self.pace = max(median(row.wall for row in rows), 1e-9)
-        _log.info(f"{self.store_text()}, {self.failed} of {self.flown} flown failed")
+        _log.info(f"{self.saved_text()}, {self.failed} of {self.flown} flown failed")
 
     def failure(self, why: str) -> RigidfleetError:
         """An error by which the sweep ends before all runs are flown."""
-        return RigidfleetError(f"{why} {self.store_text()} are saved; the same command goes on.")
+        return RigidfleetError(f"{why} {self.saved_text()} are saved; the same command goes on.")
 
-    def store_text(self) -> str:
+    def saved_text(self) -> str:
         """Runs that are saved, and where."""
         return f"{self.store.path.parent}: {self.finished_runs.sum()} of {self.runs} runs"
 
@@ -223,7 +223,7 @@ class _Sweeping:
         """Tell the progress."""
         if workers != self.workers:
             level = logging.WARNING if workers < self.workers else logging.INFO
-            _log.log(level, f"{self.store_text()}; workers: {workers}, before {self.workers}")
+            _log.log(level, f"{self.saved_text()}; workers: {workers}, before {self.workers}")
             self.workers, self.changed = workers, perf_counter()
         if not workers and perf_counter() - self.changed > _ALONE:
             raise self.failure(f"no worker came for {_ALONE:g} s. Start some by `dask worker`.")

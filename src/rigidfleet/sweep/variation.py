@@ -70,7 +70,7 @@ class Variation(Part):
         """Decode a value."""
         return code
 
-    def find_invalid_key(self) -> tuple[str, str, str] | None:
+    def key_problem_and_remedy(self) -> tuple[str, str, str] | None:
         """Key, problem and remedy of an error that involves several keys; None if there is none."""
         return None
 
@@ -103,7 +103,7 @@ class _Between(Variation):
     low: Number = required_key("lower end")
     high: Number = required_key("upper end, > low")
 
-    def find_invalid_key(self) -> tuple[str, str, str] | None:
+    def key_problem_and_remedy(self) -> tuple[str, str, str] | None:
         """Ends in the wrong order."""
         if self.low < self.high:
             return None
@@ -147,7 +147,7 @@ class _Listed(Variation):
         """Decode a value."""
         return code if self._is_numeric else self.values[int(code)]
 
-    def find_invalid_key(self) -> tuple[str, str, str] | None:
+    def key_problem_and_remedy(self) -> tuple[str, str, str] | None:
         """Error if a value is of another type, or if values that are not numbers are to be added or scaled."""
         if not all(map(_is_usable_value, self.values)):
             words = "finite numbers, words, true or false, or lists of these"

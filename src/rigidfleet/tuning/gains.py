@@ -16,7 +16,7 @@ from rigidfleet._common.toml import to_toml, toml_equals_data
 from rigidfleet.math import lqr, pid
 from rigidfleet.math.margins import Loop, LoopGains, Margins, stability_margins
 from rigidfleet.mission import Mission
-from rigidfleet.mission.files import lines_with_digests
+from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.schema import Tracking
 from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.timing import complete_times
@@ -207,7 +207,7 @@ def with_gains(text: str, gains: Gains) -> str:
     for table, key, value in _gain_entries(document, gains):
         wanted.setdefault(table, {})[key] = value
         new = _replace_line(new, table, key, to_toml({key: value}).strip())
-    return new if toml_equals_data(new, wanted) else lines_with_digests(text) + to_toml(wanted)
+    return new if toml_equals_data(new, wanted) else digest_lines(text) + to_toml(wanted)
 
 
 def _gain_entries(document: dict[str, Any], gains: Gains) -> Iterator[tuple[str, str, Any]]:

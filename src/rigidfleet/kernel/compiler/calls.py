@@ -45,11 +45,11 @@ def call_recorder(_context, address, p, w, segment, record):
     """
     from llvmlite import ir
 
-    def generate(context, builder, signature, arguments):
+    def generate_recorder_call(context, builder, signature, arguments):
         word = ir.IntType(64)
         kind = ir.FunctionType(word, [word] * 4)
         function, p, w, *rest = arguments
         words = [builder.ptrtoint(x, word) for x in (p, w)]
         return builder.call(builder.inttoptr(function, kind.as_pointer()), [*words, *rest])
 
-    return types.int64(types.int64, p, w, types.int64, types.int64), generate
+    return types.int64(types.int64, p, w, types.int64, types.int64), generate_recorder_call

@@ -316,7 +316,7 @@ def as_lanes(_context, array):
 
 
 @intrinsic
-def _reduce_lanes(_context, x, largest):
+def _sum_or_largest_lane(_context, x, largest):
     """Sum over the lanes, or the largest one; NaN if any lane is NaN."""
 
     def generate(_context: Any, builder: Any, _sig: Any, args: Any) -> ir.Value:
@@ -340,13 +340,13 @@ def _reduce_lanes(_context, x, largest):
     return types.float64(x, types.boolean), generate
 
 
-def sum_lanes_or_worst(x, states):
+def sum_lanes_or_worst_flight(x, states):
     """Sum over the lanes of x if ``states`` belong to one flight; otherwise the value of the worst flight."""
     raise NotImplementedError("compiled code only")
 
 
-@overload(sum_lanes_or_worst)
+@overload(sum_lanes_or_worst_flight)
 def _overload_lane_sum_or_worst(x, states):
     if states.dtype == lanes:
-        return lambda x, states: _reduce_lanes(x, True)
-    return lambda x, states: _reduce_lanes(x, False)
+        return lambda x, states: _sum_or_largest_lane(x, True)
+    return lambda x, states: _sum_or_largest_lane(x, False)

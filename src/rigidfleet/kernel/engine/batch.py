@@ -118,11 +118,11 @@ def can_unroll(problem: Problem) -> bool:
         and problem.reference.kind != SHAPE
         and not (problem.has_frame or problem.body_formulation or problem.disturbance.active)
         and problem.external.address == 0
-        and _count_equations(problem) <= _MOST_EQUATIONS
+        and _constraint_system_size(problem) <= _MOST_EQUATIONS
     )
 
 
-def _count_equations(problem: Problem) -> int:
+def _constraint_system_size(problem: Problem) -> int:
     edges, agents = len(problem.graph.edges), len(problem.vehicles.m)
     return min(edges, 3 * agents) if problem.law.solver == ITERATED else edges
 
@@ -138,7 +138,7 @@ def can_unroll_together(problems: Sequence[Problem]) -> bool:
         and first.law.solver in (ITERATED, EXACT)
         and first.graph.solver == 0
         and first.motion.coefficients.shape[2] == 6
-        and _count_equations(first) <= _MOST_EQUATIONS
+        and _constraint_system_size(first) <= _MOST_EQUATIONS
     ):
         return False
     return all(

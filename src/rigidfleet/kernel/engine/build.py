@@ -45,7 +45,7 @@ _HOT = (
 #: The same of sampled flights.
 _HOT_SAMPLED = ("attitude_matrix", "quaternion_rate", "thrust_of", "speed_of")
 #: Functions of the solver of large formations that return a number.
-_RETURNING = {"solve", "count_factor_blocks", "factor", "inner", "conjugate_gradients"}
+_RETURNING = {"solve", "add_block_counts", "factor", "inner", "conjugate_gradients"}
 #: Passes that simplify each translated function before inlining.
 _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
@@ -79,7 +79,7 @@ def monitor_object_code() -> list[bytes]:
     watched, word = (Problem, IntegratorState, Monitor), types.int64
     with_law = Problem, Workspace, IntegratorState, Monitor
     calls = (
-        ("bound_moves", lambda p, s, m: monitor.bound_distance_changes(p, s, m), *watched),
+        ("bound_moves", lambda p, s, m: monitor.write_first_step_change_bounds(p, s, m), *watched),
         ("watch_trail_distances",
          lambda i, j, p, s, m: monitor.watch_trail_distances(i, j, p, s, m), word, word, *watched),
         ("watch_forces", lambda last, p, w, s, m: monitor.watch_forces(last, p, w, s, m), word, *with_law),
@@ -220,4 +220,4 @@ def main(part: str) -> None:
             objects.build_command("apart"), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
         )
         codes = flight_object_code(second)
-    sys.stdout.buffer.write(objects.join_object_codes(codes))
+    sys.stdout.buffer.write(objects.pack_object_codes(codes))

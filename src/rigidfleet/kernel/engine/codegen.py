@@ -226,17 +226,17 @@ integrate = compiled_copy(
 )
 
 
-def _code_lines(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted):
-    """Straight-line code: each copy of `_derivative` has its own."""
+def _run_code(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted):
+    """Straight-line code: each copy of `_write_dy` has its own."""
     raise NotImplementedError
 
 
-def _derivative(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted):
-    _code_lines(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted)
+def _write_dy(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted):
+    _run_code(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted)
 
 
 #: Number of arrays that the code takes, and ``wanted``, bits in the form of an address.
-_ARGUMENTS = _derivative.__code__.co_argcount
+_ARGUMENTS = _write_dy.__code__.co_argcount
 
 
 def _compile(code: Code, name: str) -> int:
@@ -254,7 +254,7 @@ def _compile(code: Code, name: str) -> int:
         return types.void(*kinds), generate
 
     return compiled_for_c(
-        _derivative, f"derivative_{name}", arguments=_ARGUMENTS, _code_lines=straight_line_intrinsic
+        _write_dy, f"derivative_{name}", arguments=_ARGUMENTS, _run_code=straight_line_intrinsic
     )
 
 
@@ -325,7 +325,7 @@ def _symbol_evaluator(
 
 
 def _emit_code(module: ir.Module, code: Code) -> ir.Function:
-    """Write the code as a function of the arguments of `_derivative`."""
+    """Write the code as a function of the arguments of `_write_dy`."""
     pointer = ir.DoubleType().as_pointer()
     kind = ir.FunctionType(ir.VoidType(), [pointer] * _ARGUMENTS)
     function = ir.Function(module, kind, "straight_line")

@@ -79,11 +79,11 @@ _AA, _EA, _HALF_A = A @ A, E @ A, HALF @ A
 
 
 @jit_inline
-def _weighted_stage_sum(k, q, w, first, end):
-    """Sum of w_j k[j, q] over stage 0 and the stages from ``first`` to before ``end``, literals."""
-    total = w[0] * k[0, q]
+def _weighted_stage_sum(K, q, w, first, end):
+    """Sum of w_j K[j, q] over stage 0 and the stages from ``first`` to before ``end``, literals."""
+    total = w[0] * K[0, q]
     for s in range(first, end):
-        total += w[s] * k[s, q]
+        total += w[s] * K[s, q]
     return total
 
 
@@ -93,7 +93,7 @@ def _weights(w, h):
 
 
 @jit_inline
-def _write_state(k, row, coordinates, w, x, hc, s):
+def _write_state(K, row, coordinates, w, x, hc, s):
     """Write into a row the state that the first s stages, a literal, lead to, so that no term of weight zero is left.
 
     ``w`` and ``x`` are the `_weights` of accelerations in velocities and in positions, ``hc`` the time to it [s].
@@ -103,74 +103,74 @@ def _write_state(k, row, coordinates, w, x, hc, s):
         of_rates = of_positions = 3
     for q in range(coordinates):
         i = coordinates + q
-        v = k[STATE, i]
-        r = k[STATE, q] + hc * v
+        v = K[STATE, i]
+        r = K[STATE, q] + hc * v
         if s > 1:
-            r += _weighted_stage_sum(k, i, x, of_positions, s - 1)
-        k[row, i] = v + _weighted_stage_sum(k, i, w, of_rates, s)
-        k[row, q] = r
-    for q in range(2 * coordinates, k.shape[1]):
-        k[row, q] = k[STATE, q] + _weighted_stage_sum(k, q, w, of_rates, s)
+            r += _weighted_stage_sum(K, i, x, of_positions, s - 1)
+        K[row, i] = v + _weighted_stage_sum(K, i, w, of_rates, s)
+        K[row, q] = r
+    for q in range(2 * coordinates, K.shape[1]):
+        K[row, q] = K[STATE, q] + _weighted_stage_sum(K, q, w, of_rates, s)
 
 
 @jit_inline
-def _write_trial_of_stage(k, coordinates, s, h):
+def _write_trial_of_stage(K, coordinates, s, h):
     """Write the state of stage s, a literal."""
-    _write_state(k, TRIAL, coordinates, _weights(A[s], h), _weights(_AA[s], h * h), h * C[s], s)
+    _write_state(K, TRIAL, coordinates, _weights(A[s], h), _weights(_AA[s], h * h), h * C[s], s)
 
 
 @jit_inline
-def _count_coordinates(k, p):
+def _count_coordinates(K, p):
     """Number of coordinates of all positions, for an `UnrolledProblem` p."""
-    return (k.shape[1] - p.before.shape[0]) // 2
+    return (K.shape[1] - p.before.shape[0]) // 2
 
 
 @jit_inline
-def write_stage_state(k, stage, _a, h, p):
+def write_stage_state(K, stage, _a, h, p):
     """As `dopri5.write_stage_state`."""
-    coordinates = _count_coordinates(k, p)
+    coordinates = _count_coordinates(K, p)
     p.stage[0] = stage
     if stage == 0:
-        for q in range(k.shape[1]):
-            k[TRIAL, q] = k[STATE, q]
+        for q in range(K.shape[1]):
+            K[TRIAL, q] = K[STATE, q]
     elif stage == 1:
-        _write_trial_of_stage(k, coordinates, 1, h)
+        _write_trial_of_stage(K, coordinates, 1, h)
     elif stage == 2:
-        _write_trial_of_stage(k, coordinates, 2, h)
+        _write_trial_of_stage(K, coordinates, 2, h)
     elif stage == 3:
-        _write_trial_of_stage(k, coordinates, 3, h)
+        _write_trial_of_stage(K, coordinates, 3, h)
     elif stage == 4:
-        _write_trial_of_stage(k, coordinates, 4, h)
+        _write_trial_of_stage(K, coordinates, 4, h)
     elif stage == 5:
-        _write_trial_of_stage(k, coordinates, 5, h)
+        _write_trial_of_stage(K, coordinates, 5, h)
     elif stage == 6:
-        _write_trial_of_stage(k, coordinates, 6, h)
+        _write_trial_of_stage(K, coordinates, 6, h)
     elif stage == 7:
-        _write_trial_of_stage(k, coordinates, 7, h)
+        _write_trial_of_stage(K, coordinates, 7, h)
     else:
-        _write_trial_of_stage(k, coordinates, 8, h)
+        _write_trial_of_stage(K, coordinates, 8, h)
 
 
 @jit_inline
-def _squared_error(k, q, e, rtol):
+def _squared_error(K, q, e, rtol):
     """Square of an error over its tolerance."""
-    size = max(abs(k[STATE, q]), abs(k[TRIAL, q]))
-    e *= rough_inverse(k[ATOL, q] + rtol * size)
+    size = max(abs(K[STATE, q]), abs(K[TRIAL, q]))
+    e *= rough_inverse(K[ATOL, q] + rtol * size)
     return e * e
 
 
 @jit_inline
-def squared_errors(k, h, rtol, p):
+def squared_errors(K, h, rtol, p):
     """As `dopri5.squared_errors`."""
-    coordinates = _count_coordinates(k, p)
+    coordinates = _count_coordinates(K, p)
     squares = fill_lanes(0.0)
     v, r = _weights(E, h), _weights(_EA, h * h)
     for q in range(coordinates):
         i = coordinates + q
-        squares += _squared_error(k, q, _weighted_stage_sum(k, i, r, 3, STAGES - 1), rtol)
-        squares += _squared_error(k, i, _weighted_stage_sum(k, i, v, 3, STAGES), rtol)
-    for q in range(2 * coordinates, k.shape[1]):
-        squares += _squared_error(k, q, _weighted_stage_sum(k, q, v, 3, STAGES), rtol)
+        squares += _squared_error(K, q, _weighted_stage_sum(K, i, r, 3, STAGES - 1), rtol)
+        squares += _squared_error(K, i, _weighted_stage_sum(K, i, v, 3, STAGES), rtol)
+    for q in range(2 * coordinates, K.shape[1]):
+        squares += _squared_error(K, q, _weighted_stage_sum(K, q, v, 3, STAGES), rtol)
     return squares
 
 
@@ -186,12 +186,12 @@ def _write_half_bernstein(points, q, y, quarter, y_new, slope, slope_new):
 
 
 @jit_inline
-def _write_bernstein_halves(k, q, slopes, h, early, late):
+def _write_bernstein_halves(K, q, slopes, h, early, late):
     """Write the coefficients of a state over both halves of a step into ``early`` and ``late`` (5, n).
 
     Between, it is the polynomial of fifth degree through three states with their derivatives, ``slopes``.
     """
-    y, middle, y_new = k[STATE, q], k[MIDDLE, q], k[TRIAL, q]
+    y, middle, y_new = K[STATE, q], K[MIDDLE, q], K[TRIAL, q]
     d, d_middle, d_new = slopes
     quarter = (45 / 128) * y + (72 / 128) * middle + (11 / 128) * y_new
     quarter += (h / 256) * (9.0 * d - 36.0 * d_middle - 3.0 * d_new)
@@ -203,9 +203,9 @@ def _write_bernstein_halves(k, q, slopes, h, early, late):
 
 
 @jit
-def record_trail_forces(p, state, array, row):
+def record_trail_forces(p, state, array_index, row):
     """Write the forces that the code has evaluated into a row of an array of each flight's trail."""
-    forces, addresses = state.trail.gauge.shape[1], p.trails[array]
+    forces, addresses = state.trail.gauge.shape[1], p.trails[array_index]
     for g in range(forces):
         scatter_lanes(p.gauge[g], addresses, forces * row + g)
 
@@ -216,25 +216,25 @@ def record_step(t, h, p, w, state):
 
     The halves of the step are kept as two.
     """
-    k, trails, rows = state.K, p.trails, state.trail.clock.shape[0]
-    coordinates, n = _count_coordinates(k, p), k.shape[1]
+    K, trails, rows = state.K, p.trails, state.trail.clock.shape[0]
+    coordinates, n = _count_coordinates(K, p), K.shape[1]
     # The first half goes to the next row of the trail, the second to the one after it. The forces of the end are there
     # already, as those of the last stage; the code for the middle overwrites them, so they are stored first.
     row = (state.count[FIRST_ROW] + state.count[TRAILED]) % rows
     after = (row + 1) % rows
     record_trail_forces(p, state, GAUGE, after)
     w_half, x_half = _weights(HALF, h), _weights(_HALF_A, h * h)
-    _write_state(k, MIDDLE, coordinates, w_half, x_half, 0.5 * h, STAGES)
+    _write_state(K, MIDDLE, coordinates, w_half, x_half, 0.5 * h, STAGES)
     p.stage[0] = 0  # forces are asked for, as at a start
-    closed_loop(t + 0.5 * h, k[MIDDLE], k[SLOPE], p, w)
+    closed_loop(t + 0.5 * h, K[MIDDLE], K[SLOPE], p, w)
     state.count[EVALUATIONS] += 1
     record_trail_forces(p, state, GAUGE, row)
     early, late = p.halves[0], p.halves[1]
     for q in range(coordinates):
         i = coordinates + q
-        _write_bernstein_halves(k, q, (k[STATE, i], k[MIDDLE, i], k[TRIAL, i]), h, early, late)
+        _write_bernstein_halves(K, q, (K[STATE, i], K[MIDDLE, i], K[TRIAL, i]), h, early, late)
     for q in range(coordinates, n):
-        _write_bernstein_halves(k, q, (k[0, q], k[SLOPE, q], k[STAGES - 1, q]), h, early, late)
+        _write_bernstein_halves(K, q, (K[0, q], K[SLOPE, q], K[STAGES - 1, q]), h, early, late)
     for half in range(2):
         place = row if half == 0 else after
         scatter_lanes(fill_lanes(t + half * 0.5 * h), trails[CLOCK], 2 * place)

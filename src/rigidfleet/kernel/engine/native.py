@@ -34,7 +34,7 @@ from rigidfleet.kernel.compiler.levels import (
 from rigidfleet.kernel.engine.objects import (
     ENTRIES,
     compile_objects,
-    join_object_codes,
+    pack_object_codes,
     shipped_object_path,
     split_object_codes,
     symbol_name,
@@ -117,7 +117,7 @@ class Watch:
         self._packed = pack_uncached(self.monitor)
         self.address = self._packed.address
 
-    def bound_distance_changes(self, problem: Problem, state: IntegratorState) -> None:
+    def write_first_step_change_bounds(self, problem: Problem, state: IntegratorState) -> None:
         """Bound how far distances change over the first step, into ``monitor.moves``."""
         library().bound_moves(pack(problem).address, pack(state).address, self.address)
 
@@ -291,7 +291,7 @@ def _cache_code(parts: Sequence[bytes], part: str) -> None:
     """Store machine code in the cache, or warn that it will be compiled again."""
     try:
         with replace_atomically(_cache_file(part), private=True) as stream:
-            stream.write(join_object_codes(parts))
+            stream.write(pack_object_codes(parts))
     except OSError as error:
         warn_not_cached(error)
 

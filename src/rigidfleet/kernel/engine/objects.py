@@ -102,14 +102,14 @@ def target_machine() -> Any:
     )  # fmt: skip
 
 
-def join_object_codes(parts: Sequence[bytes]) -> bytes:
+def pack_object_codes(parts: Sequence[bytes]) -> bytes:
     """Join objects, each after its length, with a digest, so that an incomplete file is never used."""
     code = b"".join(len(part).to_bytes(8, "little") + part for part in parts)
     return code + hashlib.sha256(code).digest()
 
 
 def split_object_codes(data: bytes) -> list[bytes] | None:
-    """Objects that were `join_object_codes`; None if they are not whole."""
+    """Objects that `pack_object_codes` has packed; None if they are not whole."""
     code, digest = data[:-32], data[-32:]
     if not code or hashlib.sha256(code).digest() != digest:
         return None

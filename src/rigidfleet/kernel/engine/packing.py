@@ -213,7 +213,7 @@ def _large_solver_examples() -> tuple[Any, ...]:
                   "I_inv": frame, "a": a, "f_C": a},
         "multipliers": {"u": a, "order": order, "f": a, "multiplier": b},
         "elimination_tree": tree,
-        "count_factor_blocks": tree | {"count": k, "most": 1},
+        "add_block_counts": tree | {"count": k, "most": 1},
         "list_factor_blocks": tree | {"free": k, "out": Pattern(*(k,) * 7)},
         "assemble": matrix | {"place": k, "column": k, "of_edge": k, "L": blocks},
         "factor": rows | {"L": blocks, "at": k},

@@ -209,24 +209,24 @@ class Trace:
             return math.sqrt(x)
         return self.symbol("root", x, self.symbol("inverse_root", x))
 
-    def _series(self, xx: Any, first: int, rate: int = 0) -> Any:
-        """Sum of (-xx)^k / (2 k + first)!, or its derivative with respect to xx; xx at most the square of `_WIDEST`."""
+    def _series(self, square: Any, first: int, derivative: int = 0) -> Any:
+        """Sum of (-x)^k / (2 k + first)!, or its derivative; x is the square of an angle, at most that of `_WIDEST`."""
         weights = [(-1.0) ** k / math.factorial(2 * k + first) for k in range(_TERMS)]
-        weights = [k * w for k, w in enumerate(weights)][1:] if rate else weights
+        weights = [k * w for k, w in enumerate(weights)][1:] if derivative else weights
         total = weights[-1]
         for weight in weights[-2::-1]:
-            total = total * xx + weight
+            total = total * square + weight
         return total
 
     def _angle_square(self, x: Any) -> Any:
         """The square of an angle [rad], which must not be too wide for the series."""
         xx = x * x
-        self._refuse_wide_angle(xx)
+        self._add_narrow_angle_condition(xx)
         return xx
 
-    def _refuse_wide_angle(self, xx: Any) -> None:
-        if isinstance(xx, Symbol):
-            self.positive.append(self.subtract(_WIDEST, xx))
+    def _add_narrow_angle_condition(self, square: Any) -> None:
+        if isinstance(square, Symbol):
+            self.positive.append(self.subtract(_WIDEST, square))
 
     def _sine(self, x: Any) -> Any:
         return x * self._series(self._angle_square(x), 1) if isinstance(x, Symbol) else math.sin(x)
@@ -236,7 +236,7 @@ class Trace:
 
     def _rate_factors(self, xx: Any, s: Any) -> tuple[Any, ...]:
         """As `control.rate_factors`, without its branch."""
-        self._refuse_wide_angle(xx)
+        self._add_narrow_angle_condition(xx)
         a, b = self._series(xx, 2), self._series(xx, 3)
         twice = s + s
         return a, b, twice * self._series(xx, 2, 1), twice * self._series(xx, 3, 1)
@@ -439,9 +439,9 @@ class Code:
         needed = self._collect_new_symbols([*self.positive, *self.outputs])
         last = self._collect_new_symbols(self.gauge)
         self.before = [x for x in needed + last if x.known == UNIFORM]
-        self.moment = _operations_in_order(x for x in needed + last if UNIFORM < x.known < STATE)
-        self.lines = _operations_in_order(x for x in needed if x.known == STATE)
-        self.last = _operations_in_order(x for x in last if x.known == STATE)
+        self.moment = _operations_among(x for x in needed + last if UNIFORM < x.known < STATE)
+        self.lines = _operations_among(x for x in needed if x.known == STATE)
+        self.last = _operations_among(x for x in last if x.known == STATE)
         of_state = [x for line in self.lines + self.last for x in line.arguments]
         of_state += self.outputs + self.gauge + self.positive
         self.known = _distinct_symbols(of_state, range(FLIGHT, STATE))
@@ -466,7 +466,7 @@ class Code:
         return symbols
 
 
-def _operations_in_order(symbols: Iterable[Symbol]) -> list[Symbol]:
+def _operations_among(symbols: Iterable[Symbol]) -> list[Symbol]:
     """Those that are no sources, in the order in which the kernel computes them."""
     return sorted((x for x in symbols if x.operation not in SOURCES), key=lambda x: x.serial)
 

@@ -32,11 +32,11 @@ def symbolic_factorisation(n: int, edges: NDArray[np.integer], order: Ints, most
     parent, mark, count = (np.full(n, -1) for _ in range(3))
     native.call_large("elimination_tree", first, left, parent, mark)
     mark[:], count[:] = -1, 1
-    fill = native.call_large("count_factor_blocks", first, left, parent, mark, count, int(most * n))
+    fill = native.call_large("add_block_counts", first, left, parent, mark, count, int(most * n))
     if not fill:
         parent[:] = -1  # no fill is inherited
         mark[:], count[:] = -1, 1
-        native.call_large("count_factor_blocks", first, left, parent, mark, count, 1 << 62)
+        native.call_large("add_block_counts", first, left, parent, mark, count, 1 << 62)
     column = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
     blocks = int(column[-1])
     blocks_of = Pattern(

@@ -69,7 +69,7 @@ class Ball:
         """Move on for h [s]."""
         self.place = self.place + h * self.velocity
 
-    def predicted_sphere(self, t: float) -> obstacles.Sphere:
+    def sphere_flying_on(self, t: float) -> obstacles.Sphere:
         """The obstacle from t [s] on, if nobody pushes it."""
         return self._sphere_on_way([(t, self.place), (t + 1e3, self.place + 1e3 * self.velocity)])
 

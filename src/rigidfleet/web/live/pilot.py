@@ -439,7 +439,7 @@ class Pilot:
         if self.moved:
             self.moved = False
             seen = [
-                ball.predicted_sphere(self.t) if ball.until is None else ball.flown_sphere(self.t)
+                ball.sphere_flying_on(self.t) if ball.until is None else ball.flown_sphere(self.t)
                 for ball in self.balls
             ]
             self.flight.replace_obstacles((*self.mission.obstacles, *seen))

@@ -94,7 +94,7 @@ class Session:
             "loss": None if self.mission.network is None else self.mission.network.loss,
         }
 
-    def store_flight(self) -> None:
+    def keep_flight_and_call_landed(self) -> None:
         """Keep the flight, and pass it to ``landed``."""
         if self.pilot.ticks > 1:
             self.flown = self.pilot.result()
@@ -200,7 +200,7 @@ class Session:
                 case {"speed": float(speed) | int(speed)} if speed in SPEEDS:
                     self.speed = float(speed)
                 case {"again": True}:
-                    self.store_flight()
+                    self.keep_flight_and_call_landed()
                     self.begin_flight()
                 case {"stop": True}:
                     self.stop()
@@ -221,7 +221,7 @@ class Session:
             self.stop()
             try:
                 with self.lock:
-                    self.store_flight()
+                    self.keep_flight_and_call_landed()
             finally:
                 self._close_pages()
 

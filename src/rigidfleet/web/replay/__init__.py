@@ -97,7 +97,7 @@ def replay(result: Result | str | Path, path: str | Path | None = None) -> Repla
 
 def replay_page(result: Result) -> str:
     """The page that `replay` writes."""
-    time, shown = _even_times(result), _drawn_edges(result)
+    time, shown = _even_times(result), _indices_of_drawn_edges(result)
     most = float(np.nanmax(np.abs(result.multiplier[:, shown]), initial=0.0))
     scale = mean_weight(result.mission)
     tension = min(max(most, _IDLE * scale), _HEAVY * scale)
@@ -147,7 +147,7 @@ def _interpolate(result: Result, values: Floats, time: Floats) -> Floats:
     return np.where(np.isfinite(between), between, np.where(share < 1.0, low, high))
 
 
-def _drawn_edges(result: Result) -> Ints:
+def _indices_of_drawn_edges(result: Result) -> Ints:
     """Indices of the edges drawn: all, or the shortest if there are too many."""
     if len(result.edges) <= _EDGES:
         return np.arange(len(result.edges))

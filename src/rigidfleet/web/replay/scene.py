@@ -190,15 +190,15 @@ def scene_points(mission: Mission, low: Floats, high: Floats) -> Floats:
     return np.stack([ends[:, pick[a], a] for a in range(3)], axis=2).reshape(-1, 3)
 
 
-def thrust_directions(force: Floats, mass: Floats) -> Floats:
+def thrust_directions(thrust: Floats, mass: Floats) -> Floats:
     """Unit vectors (..., N, 3) along the thrust, in which the vehicles' rotors point.
 
     Upwards if the thrust is below 2 % of the weight on Earth, since its direction is then noise.
     """
-    strength = np.linalg.norm(force, axis=-1)
+    strength = np.linalg.norm(thrust, axis=-1)
     up = np.maximum(0.2 * mass - strength, 0.0)
-    force = force + up[..., None] * np.array([0.0, 0.0, 1.0])
-    return force / np.maximum(np.linalg.norm(force, axis=-1, keepdims=True), 1e-300)
+    thrust = thrust + up[..., None] * np.array([0.0, 0.0, 1.0])
+    return thrust / np.maximum(np.linalg.norm(thrust, axis=-1, keepdims=True), 1e-300)
 
 
 def typical_formation_radius(result: Result) -> float:
@@ -225,12 +225,12 @@ def _plots(result: Result) -> Iterator[tuple[dict[str, Any], PackedColumn]]:
     limits = mission.limits
     colours = agent_colours(n) if n <= _LINES else ["#8FA3B8", "#20262D"]
 
-    def plot_entry(name: str, title: str, values: Floats, step: float, **look: Any) -> Any:
+    def plot_entry(name: str, title: str, values: Floats, rounding_step: float, **look: Any) -> Any:
         basic = {
             "column": f"{name} plot", "title": title, "unit": "m", "colours": ["#20262D"], "worst": "greatest",
             "limits": [None], "least": None, "log": False, "floor": _FLOOR, "band": False,
         }  # fmt: skip
-        return basic | look, PackedColumn(values, step)
+        return basic | look, PackedColumn(values, rounding_step)
 
     if has_rotors(result):
         share = 100.0 * rotor_forces(result).max(axis=2) / rotor_limit(mission)
