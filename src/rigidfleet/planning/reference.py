@@ -71,7 +71,7 @@ def copy_as(kind: type[State], state: Any, **fields: Any) -> State:
     return new
 
 
-@dataclass
+@dataclass(frozen=True)
 class Pose:
     """Pose of the virtual body, actual or desired: CM [m], attitude T (world -> body) and their rates.
 
@@ -102,7 +102,7 @@ def pose_at(motion: Motion, t: float) -> Pose:
     return Pose(r, v, axes[0].T, omega, a=a, jerk=jerk, alpha=alpha, alpha_dot=alpha_dot)
 
 
-@dataclass
+@dataclass(frozen=True)
 class PhaseState:
     """The state at a switch between phases, and the last commands."""
 
@@ -123,7 +123,7 @@ class PhaseState:
     rates: Floats | None = None
 
     def __post_init__(self) -> None:
-        self.lost = np.zeros(len(self.r), dtype=np.bool_)
+        object.__setattr__(self, "lost", np.zeros(len(self.r), dtype=np.bool_))
 
     @property
     def pose_goal_and_slots(self) -> tuple[Pose, Pose, Floats]:

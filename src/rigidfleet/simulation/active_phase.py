@@ -16,7 +16,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.mission import Settle
 from rigidfleet.planning.disturbances import without_lost
 from rigidfleet.planning.plan import PhasePlan
-from rigidfleet.planning.reference import PhaseState
+from rigidfleet.planning.reference import PhaseState, copy_with
 from rigidfleet.simulation.callbacks import (
     Command,
     Controller,
@@ -271,7 +271,7 @@ class ActivePhase:
         self.parted = plan.links_lost[1] <= self.t
         if now.any():
             self.lost = self.lost | now
-            plan.before.lost = self.lost
+            plan.before = copy_with(plan.before, lost=self.lost)
             self.extremes.remove_lost(self.lost)
         self.next_loss = self._loss_time()
         n = len(self.lost)
