@@ -193,7 +193,8 @@ def _first_plan(mission: Mission, anywhere: bool) -> PhasePlan:
     plan = plan_phase(mission, leg, disturbance=disturbance)
     native.pack(plan.problem)  # of arrays that are read-only, it takes six times as long
     make_read_only([plan])
-    return plan
+    # What only losses need holds the mission, which then would not be freed as soon as nobody uses it.
+    return plan if plan.loses else copy_with(plan, damping=None)
 
 
 @with_earlier_members(
