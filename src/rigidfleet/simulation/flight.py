@@ -18,7 +18,6 @@ from rigidfleet._common.arrays import make_read_only
 from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.errors import FlightError, MissionError, StoppedError, wrong_type
 from rigidfleet.kernel.avoidance import with_obstacles
-from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import External, Motion, workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
@@ -191,7 +190,6 @@ def _first_plan(mission: Mission, anywhere: bool) -> PhasePlan:
     leg = timed_leg(mission, mission.phases[0], state_at_start(mission), 0, anywhere=anywhere)
     disturbance = None if mission.vehicle_models else mission_disturbance(mission)
     plan = plan_phase(mission, leg, disturbance=disturbance)
-    native.pack(plan.problem)  # of arrays that are read-only, it takes six times as long
     make_read_only([plan])
     # What only losses need holds the mission, which then would not be freed as soon as nobody uses it.
     return plan if plan.loses else copy_with(plan, damping=None)

@@ -162,7 +162,7 @@ class PointPhase(ActivePhase):
         source = Unevaluated(native.pack(problem), plan.problem, samples, setup)
         if self.external is not None:  # a user's function is asked while it is at hand
             source = source.evaluate(times, self.workspace)
-        frame = np.full((len(times), 4), np.nan)
+        frame = np.broadcast_to(np.nan, (len(times), 4))
         if plan.frame is not None:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
