@@ -14,6 +14,7 @@ from rigidfleet.planning import legs, timing
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg, leg_of
 from rigidfleet.planning.preview import preview_phases
+from rigidfleet.planning.reference import copy_with
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.preflight.losses import planned_answer_to_loss
 from rigidfleet.result import Result
@@ -41,9 +42,9 @@ def planned_legs(mission: Mission, result: Result) -> list[Leg]:
             at = int(np.searchsorted(result.time, record.t_start))
             before = found[k - 1].state_at(record.t_start)
             if found[k - 1].phase.control != "tracking":
-                before.r, before.v = result.position[at], result.velocity[at]
-                q = result.frame[at]
-                before.frame = attitude.dcm_from_quaternion(q) if np.isfinite(q).all() else None
+                q, flown = result.frame[at], {"r": result.position[at], "v": result.velocity[at]}
+                frame = attitude.dcm_from_quaternion(q) if np.isfinite(q).all() else None
+                before = copy_with(before, frame=frame, **flown)
             found[k:] = [leg_of(mission, mission.phases[k], before)]
         phase = mission.phases[k]
         sure = sure and phase.settle is None and phase.control == "tracking"

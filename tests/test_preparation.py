@@ -3,6 +3,8 @@
 import copy
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import FrozenInstanceError, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -76,6 +78,50 @@ def test_a_force_changes_only_its_own_flight():
     pushed = simulate(mission, force=lambda t, r, v: np.full(r.shape, 0.1))
     assert np.abs(pushed.position - calm.position).max() > 1e-3
     same(simulate(mission), calm)
+
+
+def alter_all(x: Any) -> None:
+    """Try to alter a thing and all that it holds: arrays, attributes, lists and tables."""
+    if isinstance(x, np.ndarray) and x.flags.writeable:
+        x[...] = 1
+    elif isinstance(x, list | dict):
+        for part in [*(x.values() if isinstance(x, dict) else x)]:
+            alter_all(part)
+        x.clear()
+    elif isinstance(x, tuple):
+        for part in x:
+            alter_all(part)
+    elif is_dataclass(x):
+        for name, part in [*vars(x).items()]:
+            alter_all(part)
+            with suppress(FrozenInstanceError):
+                setattr(x, name, None)
+
+
+THROUGH = [{"position": [2.0, 1.0, 9.0], "time": 2.0}]
+STARTS = {
+    "shape": {},
+    "waypoints": {"kind": "fly", "position": [4.0, 2.0, 9.0], "duration": 5.0, "through": THROUGH},
+}
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_who_alters_the_plan_of_a_flight_alters_no_other_flight(start):
+    """The plan of the first phase is made once; what a flight shows of it is its own, or cannot be altered."""
+
+    def a_new_one() -> Mission:
+        phases = a_mission().to_dict()["phases"]
+        phases = [STARTS[start] or phases[0], phases[1]]
+        return a_mission(phases=phases, smoothness="jerk", formulation="inertial")
+
+    mission, other = a_new_one(), simulate(a_new_one())
+    flight = Flight(mission)
+    assert flight.begin()
+    alter_all(flight.plan)
+    assert flight.plan.problem is None
+    result = simulate(mission)
+    same(result, other)
+    assert result.phases == other.phases
 
 
 def examples() -> list:

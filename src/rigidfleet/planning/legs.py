@@ -263,11 +263,12 @@ def _attach_frame(
             T = near if mission.body_frame is not None else mission.drawn_attitude
         pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
         if now.v.any():
-            pose.omega = T @ mean_axis_rates(x[None], about_cm(now.v, masses)[None], masses)[0]
+            omega = mean_axis_rates(x[None], about_cm(now.v, masses)[None], masses)[0]
+            pose = copy_with(pose, omega=T @ omega)
         if now.lost.any() and fit is not None:
             centre = masses @ fit / masses.sum()  # of the remaining agents, from the body's origin
-            pose.r = pose.r - T.T @ centre
-            pose.v = pose.v - T.T @ np.cross(pose.omega, centre)
+            v = pose.v - T.T @ np.cross(pose.omega, centre)
+            pose = copy_with(pose, r=pose.r - T.T @ centre, v=v)
     slots = now.slots if now.slots is not None else about_cm(now.r, masses) @ pose.T.T
     goal = now.goal or copy_with(pose, v=np.zeros(3), omega=np.zeros(3))
     if establishing is not None and target is not None:

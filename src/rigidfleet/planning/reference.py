@@ -33,6 +33,8 @@ class ByEdge:
         """Values (m,) of edges (m, 2), i < j; for new edges ``other``, (m,) or of so many flights (B, m)."""
         if arrays_equal(edges, self.edges):  # most phases have those of the phase before
             return self.values.copy()
+        if not len(self.edges):  # as at the start of every flight
+            return np.zeros(len(edges)) + other()
         keys, own = _edge_codes(edges), _edge_codes(self.edges)
         order = np.argsort(own)
         at = np.append(order, len(order))[np.searchsorted(own, keys, sorter=order)]
@@ -71,7 +73,7 @@ def copy_as(kind: type[State], state: Any, **fields: Any) -> State:
     return new
 
 
-@dataclass
+@dataclass(frozen=True)
 class Pose:
     """Pose of the virtual body, actual or desired: CM [m], attitude T (world -> body) and their rates.
 
@@ -102,7 +104,7 @@ def pose_at(motion: Motion, t: float) -> Pose:
     return Pose(r, v, axes[0].T, omega, a=a, jerk=jerk, alpha=alpha, alpha_dot=alpha_dot)
 
 
-@dataclass
+@dataclass(frozen=True)
 class PhaseState:
     """The state at a switch between phases, and the last commands."""
 
@@ -123,7 +125,7 @@ class PhaseState:
     rates: Floats | None = None
 
     def __post_init__(self) -> None:
-        self.lost = np.zeros(len(self.r), dtype=np.bool_)
+        object.__setattr__(self, "lost", np.zeros(len(self.r), dtype=np.bool_))
 
     @property
     def pose_goal_and_slots(self) -> tuple[Pose, Pose, Floats]:

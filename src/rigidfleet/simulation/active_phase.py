@@ -16,7 +16,7 @@ from rigidfleet.kernel.problem import OPEN, Problem
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Settle
 from rigidfleet.planning.disturbances import without_lost
-from rigidfleet.planning.reference import PhaseState
+from rigidfleet.planning.reference import PhaseState, copy_with
 from rigidfleet.simulation.callbacks import (
     Command,
     Controller,
@@ -235,7 +235,7 @@ class ActivePhase:
         self.parted = plan.links_lost[1] <= at.t
         now = ~plan.before.lost & (plan.lost_at <= at.t)
         if now.any():
-            plan.before.lost = plan.before.lost | now
+            plan.before = copy_with(plan.before, lost=plan.before.lost | now)
             at.extremes.remove_lost(plan.before.lost)
         self.next_loss = self._loss_time()
         lost, y = plan.before.lost, at.state.y

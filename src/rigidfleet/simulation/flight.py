@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._common.arrays import make_read_only
 from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.errors import FlightError, MissionError, StoppedError, wrong_type
 from rigidfleet.kernel.avoidance import with_obstacles
@@ -181,9 +183,17 @@ def _with_times(mission: Mission) -> Mission | None:
     return None if timed is mission else timed
 
 
-def _first_leg(mission: Mission, anywhere: bool) -> Leg:
-    """The leg of a mission's first phase: made once, the shortest flights that are repeated save a quarter."""
-    return timed_leg(mission, mission.phases[0], state_at_start(mission), 0, anywhere=anywhere)
+def _first_plan(mission: Mission, anywhere: bool) -> PhasePlan:
+    """The plan of a mission's first phase, if no user's force acts: made once for all flights, and read-only.
+
+    By it, the shortest flights that are repeated save a fifth.
+    """
+    leg = timed_leg(mission, mission.phases[0], state_at_start(mission), 0, anywhere=anywhere)
+    disturbance = None if mission.vehicle_models else mission_disturbance(mission)
+    plan = plan_phase(mission, leg, disturbance=disturbance)
+    make_read_only([plan])
+    # What only losses need holds the mission, which then would not be freed as soon as nobody uses it.
+    return plan if plan.loses else copy_with(plan, damping=None)
 
 
 @with_earlier_members(
@@ -382,19 +392,20 @@ class Flight:
             check_phase_can_begin(self.mission, phase)
         self._leave_phase(changed=True)
         if self.mission.on_loss == "continue" or not self._is_from_route(phase):
-            self._state_now.blend = None
+            self._reached = copy_with(self._state_now, blend=None)
         if self._phases_begun:
             self._report_progress(phase, planning=True)
         try:
             # Avoidance leads the body beside its plan, from where a follow leads back; never the slots about it.
             evades = phase.follows_curves and not by_hand and layers(self.mission) is not None
-            if by_hand or self._phases_begun:
+            if by_hand or self._phases_begun or self.external is not None:
                 where = self._state_now, len(self._phases_begun)
                 leg = timed_leg(self.mission, phase, *where, anywhere=evades)
+                own = {"disturbance": self._disturbance, "external": self._push}
+                plan = plan_phase(self.mission, leg, **own)
             else:
-                leg = part_of_mission(self.mission, _first_leg, evades)
-                leg = copy_with(leg, before=copy_with(leg.before))
-            plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
+                plan = part_of_mission(self.mission, _first_plan, evades)
+                plan = copy_with(plan, through=deepcopy(plan.through))
             phase = plan.phase
             self._stop_if_flipped(plan)
             at = PlanIntegration(
@@ -670,7 +681,7 @@ class Flight:
         lost = self.mission.lost_at <= self._state_now.t
         if lost.any():
             self._extremes.remove_lost(lost)
-            self._state_now.lost = lost
+            self._reached = copy_with(self._state_now, lost=lost)
         self._answer = answer_to_loss(self.mission, self._state_now, self._legs_begun_and_ahead)
         legs = self._answer.legs
         if legs:
