@@ -964,8 +964,7 @@ def test_judging_is_light():
 
 def _fit(p: Floats, slots: Floats) -> Fit:
     """The fit of slots to agents (N, 3) at one sample."""
-    shape = shape_of_slots(slots)
-    return next(fits_by_sample(p[None], [shape], np.arange(len(p)), [shape[-1]]))
+    return next(fits_by_sample(p[None], shape_of_slots(slots), np.arange(len(p)), float))
 
 
 @pytest.mark.parametrize("flown", ["near", "mirrored", "larger", "exchanged", "scattered"])

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigidfleet._common.quantities import Quantity, quantity
+from rigidfleet._common.quantities import Quantity
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import CheckResult, Extreme, limit_check, value
 from rigidfleet.result import Result
@@ -94,7 +94,7 @@ def _avoidance_share_notes(result: Result) -> Iterator[str]:
 def _least_guarantee_margins(measured: Measurements, ending: str = "") -> list[Extreme]:
     """The least margins of each phase, between vehicles and to obstacles, or the first negative ones ("_lost")."""
     return [
-        measured.extreme_of(quantity(name + ending), p.extremes[name + ending], p.name)
+        measured.extreme_of(name + ending, p.extremes[name + ending], p.name)
         for p in measured.result.phases
         for name in ("guarantee", "clearance_guarantee")
         if name + ending in p.extremes

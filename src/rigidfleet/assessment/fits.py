@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import repeat
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,34 +63,32 @@ class Fit(NamedTuple):
 
 
 def fits_by_sample(
-    p: Floats, shapes: Sequence[SlotShape], who: Ints, limits: Iterable[float]
+    p: Floats, shape: SlotShape, who: Ints, error_limit: Callable[[float], float]
 ) -> Iterator[Fit]:
-    """Compare formations as flown at G samples, of agents ``who`` (N,) at p (G, N, 3), with the shapes of their slots.
+    """Compare a formation as flown at G samples with the shape of its slots: agents ``who`` (N,) at p (G, N, 3).
 
-    Each sample has a shape of its own, and a greatest error that is allowed [m].
+    ``error_limit``: the one that is allowed [m], of the shortest distance of two slots [m].
     """
-    slots, centred, dimensions, axes, orders, apart, _ = zip(*shapes, strict=True)
-    own, of_slots = p - p.mean(axis=1, keepdims=True), np.array(centred)
+    slots, centred, dimension, axis, order, distances, shortest = shape
+    own = p - p.mean(axis=1, keepdims=True)
     # The decompositions of the sums of p slot^T over the agents.
-    u, s, vt = np.linalg.svd(own.swapaxes(1, 2) @ of_slots)
+    u, s, vt = np.linalg.svd(own.swapaxes(1, 2) @ centred)
     turn, proper = rigid_body.best_rotation(u, s, vt)
-    if apart[0].size:
-        worst = _worst_pair_errors(p, np.array(apart))
+    if distances.size:
+        worst = _worst_pair_errors(p, distances)
     else:
-        worst = map(_worst_pair, p, slots, norms(own - of_slots @ (u @ vt).swapaxes(1, 2)))
+        worst = map(_worst_pair, p, repeat(slots), norms(own - centred @ (u @ vt).swapaxes(1, 2)))
     in_order: list[bool | None] = [None] * len(p)
-    if lines := [k for k, order in enumerate(orders) if len(order) > 2]:
+    if len(order) > 2:
         # They follow each other where they extend most.
-        x = own[lines]
-        along = np.linalg.eigh(x.swapaxes(1, 2) @ x)[1][..., -1:]
-        for k, flown in zip(lines, (x @ along)[..., 0].argsort(axis=1).tolist(), strict=True):
-            in_order[k] = flown in (orders[k], orders[k][::-1])
-    points = (turn @ np.array(axes)[..., None])[..., 0].tolist()
-    columns = dimensions, axes, limits, worst, proper.tolist(), points, in_order
-    for dimension, axis, limit, wrong, right, place, ordered in zip(*columns, strict=True):
-        error, i, j, flown, intended = wrong
+        along = np.linalg.eigh(own.swapaxes(1, 2) @ own)[1][..., -1:]
+        flown = (own @ along)[..., 0].argsort(axis=1).tolist()
+        in_order = [x in (order, order[::-1]) for x in flown]
+    points, limit = (turn @ axis).tolist(), error_limit(shortest)
+    for wrong, right, place, ordered in zip(worst, proper.tolist(), points, in_order, strict=True):
+        error, i, j, apart, intended = wrong
         pair, mirrored = (who.item(i), who.item(j)), dimension == 3 and not right
-        yield Fit(dimension, axis, limit, error, pair, flown, intended, mirrored, place, ordered)
+        yield Fit(dimension, axis, limit, error, pair, apart, intended, mirrored, place, ordered)
 
 
 def shape_of_slots(slots: Floats) -> SlotShape:
@@ -116,13 +115,13 @@ _Worst = tuple[float, int, int, float, float]
 
 
 def _worst_pair_errors(p: Floats, intended: Floats) -> Iterator[_Worst]:
-    """Worst errors of all pairs, ``intended`` (G, P) apart, at samples p (G, N, 3); of equal errors the first."""
+    """Worst errors of all pairs, ``intended`` (P,) apart, at samples p (G, N, 3); of equal errors the first."""
     i, j = pairs = proximity.all_pairs(p.shape[1])
     flown = proximity.pair_distances(p, pairs.T).T
     error = np.abs(flown - intended)
-    least = (error.max(axis=1) - _ROUNDING * intended.max(axis=1))[:, None]
+    least = error.max(axis=1, keepdims=True) - _ROUNDING * intended.max()
     k, at = (error >= least).argmax(axis=1), np.arange(len(p))
-    columns = error[at, k], i[k], j[k], flown[at, k], intended[at, k]
+    columns = error[at, k], i[k], j[k], flown[at, k], intended[k]
     return zip(*(x.tolist() for x in columns), strict=True)
 
 

@@ -7,8 +7,6 @@ from bisect import bisect_left
 from collections.abc import Iterator
 from functools import cached_property
 from itertools import pairwise
-from operator import attrgetter
-from typing import Any
 
 import numpy as np
 
@@ -41,7 +39,7 @@ _DUE = ("speed", "lowest", "highest", "thrust", "separation", "clearance", "geof
 _ENDS = ("target", "stay")
 
 #: What a verdict on a phase repeats of its record.
-_OF_RECORD = attrgetter("name", "kind", "control", "formation", "t_start", "t_end", "settled")
+_OF_RECORD = ("name", "kind", "control", "formation", "t_start", "t_end", "settled")
 
 
 class Measurements:
@@ -58,9 +56,9 @@ class Measurements:
         self.last = [self.parts[k].stop - 1 for k in self.flown]
         #: Quantities of which the record tells what happens between samples.
         self.names_recorded = set[str]().union(*(p.extremes for p in result.phases))
-        self._parts_flown = [(k, self.parts[k]) for k in self.flown]
+        self._starts = ends[self.flown]
         self._sampled: dict[str, Samples] = {}
-        self._worst_samples: dict[str, list[tuple[float, int]]] = {}
+        self._worst_ranks: dict[str, list[float]] = {}
 
     @cached_property
     def closeness(self) -> proximity.Closeness:
@@ -84,28 +82,23 @@ class Measurements:
         self, sampled: Samples, part: slice = slice(None), *, alone: bool = False
     ) -> Extreme | None:
         """The worst of some values; None if none is finite. ``alone``: nothing is known between them."""
-        rank = sampled.rank[part]
+        rank, values, result = sampled.rank[part], sampled.values, self.result
         if not rank.size:
             return None
-        return self.sample_at(
-            sampled, int(rank.argmax()) + rank.shape[1] * (part.start or 0), alone
-        )
-
-    def sample_at(self, sampled: Samples, place: int, alone: bool) -> Extreme | None:
-        """The value at a place among all ranks, as `worst_sample`."""
-        values, result = sampled.values, self.result
-        k, i = divmod(place, sampled.rank.shape[1])
-        if sampled.rank.item(k, i) == -math.inf:
+        k, place = divmod(int(rank.argmax()), rank.shape[1])
+        if rank.item(k, place) == -math.inf:
             return None
-        at = (k,) if values.ndim == 1 else (k, i)
+        k += part.start or 0
+        at = (k,) if values.ndim == 1 else (k, place)
         who = owner_name(result, sampled.quantity, *sampled.owner(*at))
         phase = result.phases[result.phase.item(k)].name
         return Extreme(values.item(at), result.time.item(k), who, phase, alone)
 
     # -- between samples ------------------------------------------------------------------------------
 
-    def extreme_of(self, q: Quantity, x: Extremum, phase: str) -> Extreme:
+    def extreme_of(self, name: str, x: Extremum, phase: str) -> Extreme:
         """An extreme of a phase, as it was recorded."""
+        q = quantity(name)
         return Extreme(_in_unit(q, x), x.time, owner_name(self.result, q, x.who, x.other), phase)
 
     def worst(self, name: str) -> Extreme | None:
@@ -122,7 +115,7 @@ class Measurements:
         rank = q.rank
         every = [(p.extremes[name], p.name) for p in self.result.phases if name in p.extremes]
         worst = max(every, key=lambda each: rank(_in_unit(q, each[0])), default=None)
-        between = None if worst is None else self.extreme_of(q, *worst)
+        between = None if worst is None else self.extreme_of(name, *worst)
         sampled = None if values is None else self.worst_sample(values, alone=between is None)
         if sampled is None or between is None:
             return sampled or between
@@ -132,29 +125,27 @@ class Measurements:
     def worst_by_phase(self) -> list[dict[str, Extreme]]:
         """The worst values of each phase, at its samples or between them, by name."""
         every: list[dict[str, Extreme]] = [{} for _ in self.parts]
-        phases = [*zip(self.result.phases, every, strict=True)]
+        phases = [*zip(self.result.phases, self.parts, every, strict=True)]
         for q in (q for q in QUANTITIES.values() if q.by_phase):
-            name, samples, sampled = q.name, self.worst_samples(q.name), self.samples_of(q.name)
+            name, ranks, sampled = q.name, self.worst_ranks(q.name), self.samples_of(q.name)
             alone = name not in self.names_recorded
-            for (phase, worst), (rank, place) in zip(phases, samples, strict=True):
+            for (phase, part, worst), rank in zip(phases, ranks, strict=True):
                 x = phase.extremes.get(name)
                 if x is not None and (rank == -math.inf or rank < q.rank(_in_unit(q, x))):
-                    worst[name] = self.extreme_of(q, x, phase.name)
-                elif rank > -math.inf and (e := self.sample_at(sampled, place, alone)):
+                    worst[name] = self.extreme_of(name, x, phase.name)
+                elif (e := self.worst_sample(sampled, part, alone=alone)) is not None:
                     worst[name] = e
         return every
 
-    def worst_samples(self, name: str) -> list[tuple[float, int]]:
-        """Rank of the worst sample of a quantity in each phase, and its place; -infinity if none is finite."""
-        if name not in self._worst_samples:
-            rank, worst = self.samples_of(name).rank, [(-math.inf, 0)] * len(self.parts)
-            flat, n = rank.reshape(-1), rank.shape[1]
-            for index, part in self._parts_flown if n else ():
-                first = n * part.start
-                place = first + int(flat[first : n * part.stop].argmax())
-                worst[index] = flat.item(place), place
-            self._worst_samples[name] = worst
-        return self._worst_samples[name]
+    def worst_ranks(self, name: str) -> list[float]:
+        """Rank of the worst sample of a quantity in each phase; -infinity if none is finite."""
+        if name not in self._worst_ranks:
+            rank, worst = self.samples_of(name).rank, np.full(len(self.parts), -np.inf)
+            if rank.size:
+                starts = self._starts * rank.shape[1]
+                worst[self.flown] = np.maximum.reduceat(rank.reshape(-1), starts)
+            self._worst_ranks[name] = worst.tolist()
+        return self._worst_ranks[name]
 
     def first_contact(self, name: str, e: Extreme) -> Extreme | None:
         """The first contact of agents ("separation") or with an obstacle ("clearance"), of which e is the worst."""
@@ -162,7 +153,7 @@ class Measurements:
             return None
         for phase in self.result.phases:
             if (x := phase.extremes.get(f"{name}_first")) is not None:
-                return self.extreme_of(quantity(f"{name}_first"), x, phase.name)
+                return self.extreme_of(f"{name}_first", x, phase.name)
         sampled = self.samples_of(name)
         k = int(np.argmax(sampled.values <= 0.0))
         return self.worst_sample(sampled, slice(k, k + 1), alone=True) or e
@@ -231,17 +222,16 @@ class Measurements:
                     f"its {name} is up to {value(worst, unit)} off the value from its own samples"
                 )
                 yield words, float(time[k])
-        samples = {name: self.worst_samples(name) for name in _SLACK}
-        due = {*_DUE} if self.mission.limits.geofence is not None else {*_DUE} - {"geofence"}
+        ranks = {name: self.worst_ranks(name) for name in _SLACK}
         for index, phase in enumerate(result.phases):
             part, extremes = self.parts[index], phase.extremes
-            if part.stop > part.start and extremes and not extremes.keys() >= due:
+            if part.stop > part.start and extremes:
                 lacking = (x for x in _DUE if x not in extremes and self.needs_extreme(x, index))
                 if name := next(lacking, ""):
                     words = f"it lacks the worst '{name}' of phase '{phase.name}' between samples"
                     yield words, float(time[part.start])
             for name, share in _SLACK.items():
-                x, (rank, _) = extremes.get(name), samples[name][index]
+                x, rank = extremes.get(name), ranks[name][index]
                 if x is None or rank == -math.inf:
                     continue
                 slack = rounding + share * abs(rank)
@@ -261,7 +251,7 @@ class Measurements:
         if name == "geofence":
             return self.mission.limits.geofence is not None
         if name != "clearance":
-            return self.worst_samples(name)[index][0] > -math.inf
+            return self.worst_ranks(name)[index] > -math.inf
         # An obstacle that is there at the start or the end of a phase alone is not in it.
         phase = self.result.phases[index]
         there = (thing.solid.there[0] for thing in self.mission.obstacles)
@@ -275,7 +265,7 @@ class Measurements:
             fit, waypoints = self.fits_at_end.get(index), self.misses_by_waypoint.get(index, {})
             finished = index in self.flown and (result.complete or index < len(result.phases) - 1)
             yield PhaseVerdict(
-                *_OF_RECORD(record),
+                **{key: getattr(record, key) for key in _OF_RECORD},
                 finished=finished and not record.abandoned,
                 constraint=constraint_errors.get(index),
                 distances=self.edges_and_errors_at_end.get(index, (None, None))[1],
@@ -293,10 +283,10 @@ class Measurements:
     def _ends_alike(self) -> list[tuple[str, list[int], list[int]]]:
         """Phases that end in one formation of the same vehicles and links: its name, the phases, their last samples."""
         alike: dict[tuple[object, ...], tuple[list[int], list[int]]] = {}
-        lost = (self.mission.links_lost[1] < self.result.time[self.last, None]).sum(axis=1).tolist()
-        for index, k, links in zip(self.flown, self.last, lost, strict=True):
+        for index, k in zip(self.flown, self.last, strict=True):
             if (name := self.result.phases[index].formation) is not None:
-                indices, last = alike.setdefault((name, self.left[k].tobytes(), links), ([], []))
+                lost = np.count_nonzero(self.mission.links_lost[1] < self.result.time[k])
+                indices, last = alike.setdefault((name, self.left[k].tobytes(), lost), ([], []))
                 indices.append(index)
                 last.append(k)
         return [(str(key[0]), *phases) for key, phases in alike.items()]
@@ -319,21 +309,15 @@ class Measurements:
         """Fits of the formations at the end of each phase that has one."""
         from rigidfleet.mission.model import part_of_mission  # takes long to load
 
-        mission, fits, r = self.mission, {}, self.result.position
-        whole = {*np.array(self.last)[np.isfinite(r[self.last]).all(axis=(1, 2))].tolist()}
-        by_agents: dict[tuple[int, ...], list[tuple[Any, ...]]] = {}
+        mission, fits = self.mission, {}
         for name, indices, last in self._ends_alike:
-            left = tuple(np.flatnonzero(self.left[last[0]]).tolist())
-            if (shape := part_of_mission(mission, formation_shape, name, *left)) is not None:
-                limit = mission.formations[name].greatest_error(shape[-1])
-                ends = [(i, k, shape, limit) for i, k in zip(indices, last, strict=True)]
-                by_agents.setdefault(left, []).extend(end for end in ends if end[1] in whole)
-        for left, ends in by_agents.items():
-            if ends:
-                indices, last, shapes, limits = zip(*ends, strict=True)
-                who = np.array(left)
-                each = fits_by_sample(r[list(last)][:, who], shapes, who, limits)
-                fits.update(zip(indices, each, strict=True))
+            left, p = np.flatnonzero(self.left[last[0]]), self.result.position[last]
+            shape = part_of_mission(mission, formation_shape, name, *left.tolist())
+            known = np.flatnonzero(np.isfinite(p).all(axis=(1, 2))).tolist()
+            if shape is not None and known:
+                most = mission.formations[name].greatest_error
+                each = fits_by_sample(p[known][:, left], shape, left, most)
+                fits.update(zip([indices[k] for k in known], each, strict=True))
         return fits
 
     @cached_property
@@ -345,20 +329,17 @@ class Measurements:
         # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
         q = np.array([x[last] for x in (result.attitude_reference, result.frame)])
         turns = att.dcm_from_quaternion(q).swapaxes(0, 1)
-        axes = np.array([fit.axis for fit in flat.values()]).reshape(-1, 1, 1, 3)
-        aims = (axes @ turns)[..., 0, :].tolist()
-        for (index, fit), aim in zip(flat.items(), aims, strict=True):
+        for (index, fit), turn in zip(flat.items(), turns, strict=True):
             # Only tracked slots steer a line; otherwise its direction follows from the shape before.
             steers = 2 if fit.dimension == 2 else result.phases[index].control == "tracking"
-            angles = (degrees_between_vectors(fit.turned_axis, x) for x in aim[:steers])
+            aims = (fit.axis @ turn[:steers]).tolist()
+            angles = (degrees_between_vectors(fit.turned_axis, aim) for aim in aims)
             flips[index] = next(filter(math.isfinite, angles), None)
         return flips
 
     def nearest_sample(self, t: float, index: int) -> int:
         """The sample of a phase flown that is nearest to a time [s]; of two equally near the first."""
         time, part = self.result.time, self.parts[index]
-        if t >= time.item(part.stop - 1):  # as of most
-            return part.stop - 1
         after = bisect_left(time, t, part.start, part.stop - 1)
         before = max(after - 1, part.start)
         return after if abs(time[after] - t) < abs(time[before] - t) else before
@@ -375,7 +356,7 @@ class Measurements:
         for index, k in zip(self.flown, self.last, strict=True):
             record = result.phases[index]
             if (result.complete or index < len(result.phases) - 1) and not record.abandoned:
-                ends = zip(_ENDS, (record.target, record.stay), strict=True)
+                ends = ((what, getattr(record, what)) for what in _ENDS)
                 due += [(index, what, x) for what, x in ends if x is not None]
             points = enumerate((record.target or {}).get("through", ()))
             due += [(index, str(n), x) for n, x in points if x["time"] <= result.time[k]]
@@ -384,12 +365,9 @@ class Measurements:
             ("position", result.cm), ("velocity", result.cm_velocity), ("attitude", result.attitude),
             ("rates", result.rates),
         ):  # fmt: skip
-            aims = [x.get(name) for _, _, x in due]
-            if aims.count(None) == len(aims):
-                rows.append(np.full(len(aims), np.nan))
-                continue
             unknown = [math.nan] * values.shape[1]
-            aims = np.array([unknown if aim is None else aim for aim in aims])
+            aims = [unknown if (aim := x.get(name)) is None else aim for *_, x in due]
+            aims = np.reshape(aims, (-1, values.shape[1]))
             turned = name == "attitude"
             off = att.angle_between(values[at], aims) if turned else norms(values[at] - aims)
             rows.append(np.degrees(off) if turned or name == "rates" else off)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.quantities import MOTIONS, PLACES, QUANTITIES, Quantity
+from rigidfleet._common.text import agent_names
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.math.bernstein import SIZES
@@ -50,15 +51,13 @@ def norms(x: Floats, addend: Floats | None = None) -> Floats:
 def owner_name(result: Result, q: Quantity, who: int, other: int = -1) -> str:
     """Name of the owner of a value: an agent, two agents, an edge, or an agent and an obstacle (from 0)."""
     match q.who:
-        case "agent":
-            return f"agent {who + 1}"
         case "pair":
-            return f"agents {min(who, other) + 1} and {max(who, other) + 1}"
+            return agent_names(sorted((who, other)))
         case "edge":
             return f"edge {who + 1}-{other + 1}"
         case "obstacle" | "fence" | "people":
             return f"agent {who + 1}, {getattr(result.mission, PLACES[q.who])[other].name}"
-    return ""
+    return f"agent {who + 1}" if q.who == "agent" else ""
 
 
 def mask_lost(result: Result, values: Floats) -> Floats:

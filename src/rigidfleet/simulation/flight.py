@@ -412,10 +412,9 @@ class Flight:
                 len(self.phases), plan, self._extremes, self.external, self.sampler, self.pieces,
                 partial(self._report_progress, phase), self._workspaces,
             )  # fmt: skip
-            vehicles = self._vehicles
-            self._active = ActivePhase(
-                PointPropagator(at) if vehicles is None else SampledPropagator(at, vehicles)
-            )
+            fleet = self._vehicles
+            propagator = PointPropagator(at) if fleet is None else SampledPropagator(at, fleet)
+            self._active = ActivePhase(propagator)
         except MissionError as error:
             # Only where a flight leaves it open can a phase of the mission be impossible: the rest are errors.
             if by_hand or not (phase.auto_keys or phase.follows_curves):

@@ -93,14 +93,11 @@ class PlanIntegration:
         layers: LayerSamples | None = None,
     ) -> None:
         """Store a piece of the phase, with what the slots follow if they are tracked."""
-        plan, followed = self.plan, ()
-        problem = plan.problem
-        if problem.control.tracks_slots and len(times):
-            followed = ((times[0], problem.reference, problem.motion, turn),)
-        samples = times, source, integral, frame
-        self.pieces.append(
-            Piece(self.index, *samples, plan.edges, plan.attached, followed, vehicles, layers)
-        )
+        plan, problem = self.plan, self.plan.problem
+        tracked = problem.control.tracks_slots and len(times)
+        followed = ((times[0], problem.reference, problem.motion, turn),) if tracked else ()
+        samples = times, source, integral, frame, plan.edges, plan.attached, followed
+        self.pieces.append(Piece(self.index, *samples, vehicles, layers))
 
     def raise_errors(self) -> None:
         """Raise errors of the multipliers' solver, or of the monitor's solver."""

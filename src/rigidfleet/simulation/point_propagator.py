@@ -62,9 +62,8 @@ class PointPropagator:
         self.aside = at.plan.is_large and at.external is None
         if self.steps:  # after a loss
             return
-        self.steps = _FIRST_STEPS
-        if at.external is None:
-            self.steps = max(_FIRST_STEPS, _FIRST_NUMBERS // len(y))
+        numbers = _FIRST_NUMBERS if at.external is None else 0
+        self.steps = max(_FIRST_STEPS, numbers // len(y))
         if at.solver is not None:
             at.state.clock[records.NEXT_STEP] = first_step(at.plan, at.workspace, at.state)
 

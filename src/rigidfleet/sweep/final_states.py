@@ -129,8 +129,7 @@ def _failures_and_metrics(
         slots = mission.formation_slots(formation)
         if slots is None or len(slots) < 2:
             continue
-        shape, who = shape_of_slots(slots), np.arange(len(slots))
-        fits = [*fits_by_sample(r, [shape] * count, who, [allowed(shape[-1])] * count)]
+        fits = [*fits_by_sample(r, shape_of_slots(slots), np.arange(len(slots)), allowed)]
         metrics["shape_end"] = error = np.array([fit.error for fit in fits])
         metrics["shape"] = np.fmax(metrics["shape"], error)
         misshapen = error > fits[0].limit
