@@ -229,7 +229,7 @@ def for_next_phase(avoidance: AvoidanceArrays) -> AvoidanceArrays:
     return avoidance._replace(**_empty_avoidance_record(len(avoidance.b)))
 
 
-def with_obstacles(avoidance: AvoidanceArrays, all_solids: Solids) -> AvoidanceArrays:
+def avoidance_among(avoidance: AvoidanceArrays, all_solids: Solids) -> AvoidanceArrays:
     """The same avoidance among other obstacles; the first of them are those before, and what is known of them stays."""
     before = avoidance.sight
     seen = initial_sight(all_solids, before.reach, 0.0, before.swerve)

@@ -59,7 +59,7 @@ class FreeSpace(NamedTuple):
         """The same from obstacles alone."""
         return proximity.obstacle_clearances(r, radius, self.obstacles, most=most)[0]
 
-    def is_inside(self, a: Floats, b: Floats, path: Path, ways: Floats, need: float) -> Bools:
+    def is_inside_fence(self, a: Floats, b: Floats, path: Path, ways: Floats, need: float) -> Bools:
         """Whether the fence leaves the room ``need`` [m] to motions (E,), which are those of `is_clear`.
 
         Coordinates along a straight way are between those of its ends, however near the fence it runs. A path on the
@@ -103,7 +103,7 @@ def is_clear(
 
     ``ways`` (M,) bounds what each ball flies relative to the centre of mass [m].
     """
-    free = space.is_inside(a, b, offset_at, ways, need)
+    free = space.is_inside_fence(a, b, offset_at, ways, need)
     way = np.linalg.norm(b - a, axis=1)[:, None] + ways
     who, length = np.flatnonzero(free), 1.0
     low = np.zeros(len(who))

@@ -90,7 +90,7 @@ def _expand_transition(
     if phase.transition == "ways":
         report_step(f"looking for ways of the agents in '{phase.name}'")
         return [
-            _add_bent_ways(mission, number, table, phase, before, _slot_limits(mission, state()))
+            _bent_ways(mission, number, table, phase, before, _slot_limits(mission, state()))
         ], {}
     stops = _layer_stops(mission, number, phase, before)
     if stops is None:
@@ -202,7 +202,7 @@ def _slot_limits(mission: Mission, now: PhaseState | None) -> Floats:
     return box
 
 
-def _add_bent_ways(
+def _bent_ways(
     mission: Mission,
     number: int,
     table: dict[str, Any],

@@ -79,7 +79,7 @@ class Propagator(Protocol):
     def states_seen(self) -> dict[str, Floats]:
         """Copies of the states that an `Observation` shows, by its names, after an evaluation of the law."""
 
-    def end(self) -> None:
+    def hand_over(self) -> None:
         """Leave to the next phase what is not in the state; nothing is flown from then on."""
 
 
@@ -212,7 +212,7 @@ class ActivePhase:
     def end(self) -> PhaseState:
         """End the phase at its current state; return the state that the next phase starts from."""
         at = self.integration
-        self.propagator.end()
+        self.propagator.hand_over()
         at.raise_errors()
         if not (at.state.count[records.EVALUATIONS] or at.t > self.plan.start):
             return self.plan.before

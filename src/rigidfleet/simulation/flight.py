@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from rigidfleet._common.arrays import make_read_only
 from rigidfleet._common.renamed import with_earlier_members
 from rigidfleet.errors import FlightError, MissionError, StoppedError, wrong_type
-from rigidfleet.kernel.avoidance import with_obstacles
+from rigidfleet.kernel.avoidance import avoidance_among
 from rigidfleet.kernel.problem import External, Motion, workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
@@ -628,7 +628,7 @@ class Flight:
         vehicles = self._vehicles
         if vehicles is not None and vehicles.avoidance is not None:
             solids = join_solids([thing.solid for thing in obstacles])
-            vehicles.avoidance = with_obstacles(vehicles.avoidance, solids)
+            vehicles.avoidance = avoidance_among(vehicles.avoidance, solids)
 
     def deepest_contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far, with vehicle and obstacle, or None."""

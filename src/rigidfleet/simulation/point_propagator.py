@@ -165,7 +165,7 @@ class PointPropagator:
         r, v = (w.r_seen, w.v_seen) if len(noise) else (w.r, w.v)
         return {"position": r.copy(), "velocity": v.copy()}
 
-    def end(self) -> None:
+    def hand_over(self) -> None:
         """Leave nothing: all of points is in the state."""
 
     def _store_samples(self, problem: Problem, times: Floats, samples: Floats) -> None:

@@ -400,7 +400,7 @@ class SampledPropagator:
         state.count[records.ACCEPTED] += steps
         self.steps_taken_over += steps
 
-    def end(self) -> None:
+    def hand_over(self) -> None:
         """Leave the vehicles' states to the next phase, and so the workspace, to which these may refer."""
         plan, t = self.integration.plan, self.integration.t
         self.vehicles.yaw = self.vehicles.tables.yaw_at(plan.problem, t - self.lateness, self.turn)

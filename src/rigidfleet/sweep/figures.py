@@ -21,7 +21,7 @@ from rigidfleet.plotting.areas import draw_areas_from_above
 from rigidfleet.sweep.dataset import unit_and_meaning
 from rigidfleet.sweep.metrics import METRICS, readable_unit
 from rigidfleet.sweep.record import reason_in_words
-from rigidfleet.sweep.run import flight_of_fault
+from rigidfleet.sweep.run import flight_with_fault
 from rigidfleet.sweep.store import Table
 from rigidfleet.sweep.summary import (
     Borne,
@@ -187,7 +187,7 @@ def worst_runs_from_above(table: Table) -> Figure | None:
 def _draw_worst_run(ax: Axes, table: Table, case: Borne) -> None:
     """Draw the worst run of a fault: vehicles when it fails, those concerned with their ways until then."""
     assert case.worst is not None
-    result, every = flight_of_fault(table.sweep, case.worst.run)
+    result, every = flight_with_fault(table.sweep, case.worst.run)
     failure = next(check for check in assess(result).checks if not check.passed)
     end = result.time[-1] if failure.when is None else failure.when
     now = int(np.searchsorted(result.time, end - 1e-9).clip(0, len(result.time) - 1))

@@ -59,7 +59,7 @@ def _drilled_show_and_fault(sweep: Sweep, run: int) -> tuple[faults.Show, faults
     return show, faults.GeometricFault(kind, size, who, faults.random_stream(sweep.seed, run, 2))
 
 
-def flight_of_fault(sweep: Sweep, run: int) -> tuple[Result, Ints]:
+def flight_with_fault(sweep: Sweep, run: int) -> tuple[Result, Ints]:
     """The flight of a run of a drill again, and which vehicles (M,) it has."""
     from rigidfleet.simulation.flight import simulate
 

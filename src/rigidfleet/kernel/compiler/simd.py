@@ -114,7 +114,7 @@ def fill_vector(builder: ir.IRBuilder, number: ir.Value) -> ir.Value:
 
 @lower_cast(types.Float, _Lanes)
 @lower_cast(types.Integer, _Lanes)
-def _cast(context: Any, builder: Any, kind: Any, _to: Any, value: Any) -> ir.Value:
+def _spread_number(context: Any, builder: Any, kind: Any, _to: Any, value: Any) -> ir.Value:
     return fill_vector(builder, context.cast(builder, value, kind, types.float64))
 
 

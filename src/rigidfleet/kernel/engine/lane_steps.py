@@ -93,7 +93,7 @@ def _weights(w, h):
 
 
 @jit_inline
-def _write_state(K, row, coordinates, w, x, hc, s):
+def _write_stage(K, row, coordinates, w, x, hc, s):
     """Write into a row the state that the first s stages, a literal, lead to, so that no term of weight zero is left.
 
     ``w`` and ``x`` are the `_weights` of accelerations in velocities and in positions, ``hc`` the time to it [s].
@@ -116,7 +116,7 @@ def _write_state(K, row, coordinates, w, x, hc, s):
 @jit_inline
 def _write_trial_of_stage(K, coordinates, s, h):
     """Write the state of stage s, a literal."""
-    _write_state(K, TRIAL, coordinates, _weights(A[s], h), _weights(_AA[s], h * h), h * C[s], s)
+    _write_stage(K, TRIAL, coordinates, _weights(A[s], h), _weights(_AA[s], h * h), h * C[s], s)
 
 
 @jit_inline
@@ -224,7 +224,7 @@ def record_step(t, h, p, w, state):
     after = (row + 1) % rows
     record_trail_forces(p, state, GAUGE, after)
     w_half, x_half = _weights(HALF, h), _weights(_HALF_A, h * h)
-    _write_state(K, MIDDLE, coordinates, w_half, x_half, 0.5 * h, STAGES)
+    _write_stage(K, MIDDLE, coordinates, w_half, x_half, 0.5 * h, STAGES)
     p.stage[0] = 0  # forces are asked for, as at a start
     closed_loop(t + 0.5 * h, K[MIDDLE], K[SLOPE], p, w)
     state.count[EVALUATIONS] += 1
