@@ -156,7 +156,7 @@ def _likely_flight(
     spans = ends.tolist() if np.ptp(ends, axis=0).any() else []
     if plan is None or planned is None:
         blank = Piecewise(whole.time, np.full((*whole.pieces.shape[:2], 1, 1), np.nan))
-        judged |= {"names": read.names, "spans": spans, "since": read.since}
+        judged |= {"agents": read.names, "spans": spans, "since": read.since}
         flown = result_of_curve(whole.stack(blank), WORDS, **judged)
     else:
         flown = replace_ways(plan, planned, whole, spans)
