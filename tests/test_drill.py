@@ -560,7 +560,7 @@ def test_a_drill_reads_files_as_assess_does(tmp_path, capsys, monkeypatch):
 
     code, outcome = drill("plain.csv")
     assert code == 2
-    assert "gaps" in outcome.err
+    assert "the gap: `--gaps bridge`" in outcome.err
     code, outcome = drill("plain.csv", *gaps)
     assert code == 0, outcome.err
     expected = json.loads(outcome.out)

@@ -227,6 +227,18 @@ def test_falls_end_on_roofs_and_terrain_below_zero(thing, ground):
     assert ends[:, :2] == pytest.approx(r[0, :, :2], abs=1e-6)
 
 
+@pytest.mark.parametrize("turned", [{}, {"yaw_deg": 30.0}, {"yaw_deg": 30.0, "pitch_deg": 2.0}])
+def test_falls_beside_a_house_with_a_cellar_end_at_zero(turned):
+    """Without a ground, falls end on its roof and beside it at z = 0, however it is turned."""
+    data = beside(people=[{"polygon": square(99, 99), "floor": -9.0, "ceiling": 2.0}])
+    data["obstacles"] = [{"kind": "box", "min": [-6, -6, -7], "max": [6, 6, 3]} | turned]
+    own = boundaries.Boundaries(rf.Mission.from_dict(data))
+    r = np.array([[[0.0, 0.0, 20.0], [0.0, 30.0, 20.0], [30.0, 0.0, 20.0]]])
+    on, *beside_it = own.ends_of_falls(r, np.zeros((1, 3, 3)))[0, :, 2].tolist()
+    assert on == pytest.approx(3.0, abs=0.25)
+    assert beside_it == [0.0, 0.0]
+
+
 @pytest.mark.parametrize("flown", ["points", "body", "vehicles", "curves"])
 def test_flights_are_judged_between_samples(flown):
     """Records with two samples a second have the worst values of the same flight with 500, of every kind of flight."""

@@ -210,7 +210,8 @@ def test_a_gap_is_refused_or_told(absent, tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("\n".join(rows) + "\n")
     with pytest.raises(
-        TrajectoryError, match=r"'B' has no sample between 3 and 8 s, 50 times .* --gaps bridge"
+        TrajectoryError,
+        match=r"'B' has no sample between 3 and 8 s, 50 times .* the gap: `--gaps bridge`",
     ):
         judged(path)
     verdict = judged(path, gaps="bridge", separation=0.5)

@@ -404,7 +404,7 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
         k = int(shares.argmax())
         if gaps == "refuse" and shares[k] > _LONGEST:
             why = f"{name!r} has no sample between {curve.time[k]:g} and {curve.time[k + 1]:g} s, {shares[k]:.0f} times"
-            remedy = "Give its samples, or let the curve bridge the gap: `assess --gaps bridge`"
+            remedy = "Give its samples, or let the curve bridge the gap: `--gaps bridge`"
             raise _error(source, f"{why} its usual step", remedy)
         holes += [(float(shares[k]), i, k) for k in np.flatnonzero(shares > _NOTED).tolist()]
         moves = np.linalg.norm(np.diff(curve.pieces[:, :3, 0], axis=0), axis=1)

@@ -80,10 +80,9 @@ class Boundaries:
     """The fences of a mission and its places with people, as measures of states and curves."""
 
     def __init__(self, mission: Mission) -> None:
-        self.mission = mission
+        self.mission, self.g = mission, mission.gravity
         self.radius, self.k = mission.fleet.radius, mission.drag / mission.true_mass
         self.wind = np.array(mission.all_disturbances.wind)
-        self.g = mission.gravity
         kind_of = [fence.kind for fence in mission.fences]
         self.every = [
             _Boundary("people", k, partial(self._nearness_of_falls, region), CLOSE_FALL)
@@ -157,11 +156,12 @@ class Boundaries:
 
 
 def _lowest_top(thing: Obstacle) -> float:
-    """A height [m] below which nothing can lie on a terrain or a box."""
+    """The lowest height [m] of the upper side of a terrain or a box: of faces that are no steeper than 60 degrees."""
     if thing.kind == "heights":
         return float(np.array(thing.heights).min())
-    sides = thing.box_bounds  # of a turned box, no corner is known as one of its upper side
-    return float(swept_extent(thing.solid)[0, 2] if sides is None else sides[5])
+    own, rise = thing.solid, np.abs(thing.solid.turn[0, :, 2])  # of each axis of the box
+    tops = swept_extent(own)[0, 2] + rise * (own.size[0, 3:] - own.size[0, :3])
+    return float(tops[rise >= 0.5].min())
 
 
 def _distance_outside(region: Region, inclusion: bool, curves: Floats, _: Ints) -> Measured:

@@ -61,7 +61,7 @@ def draw_areas_in_space(ax: Axes3D, mission: Mission, floor: float) -> None:
 
 
 def fall_places_by_sample(result: Result) -> Floats:
-    """Where each vehicle falls that fails at a sample: places (K, N, 2) [m], on the ground, or at z = 0 without one.
+    """Where each vehicle falls that fails at a sample: places (K, N, 2) [m], as `Boundaries.ends_of_falls`.
 
     Terrain and roofs count at some heights of each fall. NaN where nothing falls, for want of gravity.
     """
