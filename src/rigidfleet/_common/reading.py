@@ -8,3 +8,5 @@ Interpolation = Literal["cubic", "linear"]
 Spans = Literal["refuse", "stand", "away"]
 #: What a long gap between two samples of a vehicle is: an error, or time in which the curve is believed.
 Gaps = Literal["refuse", "bridge"]
+#: Options that say how files of positions are read, whoever reads them.
+READING = "interpolation", "gaps", "units", "axes", "topic"

@@ -22,7 +22,6 @@ from rigidfleet.assessment.verdict import (
     CheckResult,
     Extreme,
     PhaseVerdict,
-    keeps_limit,
     limit_check,
     value,
 )
@@ -310,19 +309,16 @@ def _flying_separation_check(measured: Measurements, q: Quantity) -> Iterator[Ch
 
 def _certificate_shortfall_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """How much nearer agents come in each phase than its plan's certificate says."""
-    allowed = q.limit_of(measured.mission)
-    every = [
-        (planned["separation"] - e.value, planned["separation"], record.name, e)
-        for record, worst in zip(measured.result.phases, measured.worst_by_phase, strict=True)
-        if (planned := record.planned) is not None and (e := worst.get("separation")) is not None
-    ]
-    failed = [x for x in every if not keeps_limit(q, x[0], allowed)]
-    for nearer, planned, phase, e in failed or sorted(every, key=lambda x: -x[0])[:1]:
-        words = (
-            f"in phase '{phase}' {_separation_in_words(e)};"
-            f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
-        )
-        yield limit_check(q, replace(e, value=nearer), allowed, words)
+    allowed, checks = q.limit_of(measured.mission), []
+    for record, worst in zip(measured.result.phases, measured.worst_by_phase, strict=True):
+        if record.planned is not None and (e := worst.get("separation")) is not None:
+            planned = record.planned["separation"]
+            words = (
+                f"in phase '{record.name}' {_separation_in_words(e)};"
+                f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
+            )
+            checks.append(limit_check(q, replace(e, value=planned - e.value), allowed, words))
+    yield from _failures_or_nearest(checks)
 
 
 def _abort_separation_check(measured: Measurements) -> Iterator[CheckResult]:

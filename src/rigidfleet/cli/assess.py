@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from rigidfleet._common.quantities import LIMITS_OF_CURVES
-from rigidfleet._common.reading import Gaps, Interpolation, Spans
+from rigidfleet._common.reading import READING, Gaps, Interpolation, Spans
 from rigidfleet.cli import console
 from rigidfleet.cli.arguments import MissionName
 from rigidfleet.cli.codes import FAILED, PASSED, UNDECIDED
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _OWN = ("separation", "separation_altitude", "radius", "ground", "limits")
 _LIMITS = f"Further limits, KEY=VALUE, may be repeated: {', '.join(LIMITS_OF_CURVES)}."
 #: Options that say how files are read.
-_READ = ("interpolation", "spans", "gaps", "units", "axes", "topic", "origin")
+_READ = (*READING, "spans", "origin")
 
 
 def assess(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from rigidfleet._common.reading import Gaps, Interpolation
+from rigidfleet._common.reading import READING, Gaps, Interpolation
 from rigidfleet.cli import console
 from rigidfleet.cli.arguments import MissionName, Workers, to_whole_number
 from rigidfleet.cli.codes import BAD_INPUT, INTERRUPTED, PASSED
@@ -204,7 +204,6 @@ def _sweep_and_folder(
     from rigidfleet.mission import mission_names
     from rigidfleet.sweep import Sweep, shards, store
     from rigidfleet.sweep.definition import is_sweep_file
-    from rigidfleet.sweep.faults import READING
 
     here = Path(what)
     if stored := [here] * store.is_store(here) or (shards.shard_folders(here) if shard else []):

@@ -150,8 +150,6 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
 
     def vertical_gap(d: Floats, radii: Floats) -> Floats:
         overlap = d[0] ** 2 + d[1] ** 2 <= radii**2  # false for agents without a position
-        if not overlap.any():
-            return np.broadcast_to(np.inf, overlap.shape)
         return np.where(overlap & np.isfinite(d[2]), np.abs(d[2]) - radii, np.inf)
 
     return _least_of_pairs(r, radius, vertical_gap)

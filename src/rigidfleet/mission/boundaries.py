@@ -19,6 +19,7 @@ from rigidfleet.math.bernstein import Measure, Measured, greatest_curve_measure
 from rigidfleet.math.piecewise import Piecewise, pad
 from rigidfleet.mission.model import Mission
 from rigidfleet.mission.obstacles import Obstacle, is_ground
+from rigidfleet.solids.distance import STEEP
 from rigidfleet.solids.polygons import Region, bezier_curve_middles
 from rigidfleet.solids.records import swept_extent
 from rigidfleet.typing import Bools, Floats, Ints
@@ -161,7 +162,7 @@ def _lowest_top(thing: Obstacle) -> float:
         return float(np.array(thing.heights).min())
     own, rise = thing.solid, np.abs(thing.solid.turn[0, :, 2])  # of each axis of the box
     tops = swept_extent(own)[0, 2] + rise * (own.size[0, 3:] - own.size[0, :3])
-    return float(tops[rise >= 0.5].min())
+    return float(tops[rise >= STEEP].min())
 
 
 def _distance_outside(region: Region, inclusion: bool, curves: Floats, _: Ints) -> Measured:

@@ -186,7 +186,7 @@ def _with_times(mission: Mission) -> Mission | None:
 def _first_plan(mission: Mission, anywhere: bool) -> PhasePlan:
     """The plan of a mission's first phase, if no user's force acts: made once for all flights, and read-only.
 
-    By it, the shortest flights that are repeated save a fifth.
+    By it, the shortest flights that are repeated save a seventh.
     """
     leg = timed_leg(mission, mission.phases[0], state_at_start(mission), 0, anywhere=anywhere)
     disturbance = None if mission.vehicle_models else mission_disturbance(mission)

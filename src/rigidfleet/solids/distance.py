@@ -2,7 +2,7 @@
 
 Every function takes coordinates x, y, z that are numbers, or arrays of one shape. NumPy runs it on arrays. The kernel
 compiles the same source for numbers (`rigidfleet.kernel.compiler.elementwise`), so there is one distance in plan,
-flight and verdict. What differs between numbers and arrays is in `where`, `any_true`, `floor` and `zero_like`.
+flight and verdict. What differs between numbers and arrays is in `where`, `any_true` and `floor`.
 
 Points are in the solid's own axes, unless a docstring says otherwise.
 """
@@ -35,11 +35,6 @@ def floor(x: Numbers) -> Any:
     return np.floor(x).astype(np.int64)
 
 
-def zero_like(x: Numbers) -> Any:
-    """Zero for each number: NumPy compares two arrays in a third of the time of an array and a number."""
-    return np.zeros_like(x)
-
-
 def choose_four(test: Numbers, these: Any, others: Any) -> Any:
     """Four numbers where the test holds, four others elsewhere."""
     a, b, c, d = these
@@ -57,9 +52,8 @@ def box_distance(x: Numbers, y: Numbers, z: Numbers, box: Any) -> Numbers:
         return c
     a = np.maximum(box[0] - x, x - box[3])
     b = np.maximum(box[1] - y, y - box[4])
-    zero = zero_like(c)
-    inside = np.minimum(np.maximum(np.maximum(a, b), c), zero)
-    a, b, c = np.maximum(a, zero), np.maximum(b, zero), np.maximum(c, zero)
+    inside = np.minimum(np.maximum(np.maximum(a, b), c), 0.0)
+    a, b, c = np.maximum(a, 0.0), np.maximum(b, 0.0), np.maximum(c, 0.0)
     return np.sqrt(a * a + b * b + c * c) + inside
 
 

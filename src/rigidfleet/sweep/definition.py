@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import Field, Strict
 
 from rigidfleet._common.arguments import as_path
+from rigidfleet._common.reading import READING
 from rigidfleet._common.renamed import rename_hint, with_earlier_members
 from rigidfleet._version import __version__
 from rigidfleet.errors import MissionError, RigidfleetError, SweepError, wrong_type
@@ -472,7 +473,7 @@ class _SweepDraft:
         if drill.files and (flown := drill.model_fields_set & faults.FLOWN.keys()):
             self.add(("drill", *flown), "needs a mission that is flown", "remove it, or files")
         if not (drill.files or drill.stale):
-            for name in drill.model_fields_set.intersection(faults.READING):
+            for name in drill.model_fields_set.intersection(READING):
                 self.add(("drill", name), "has no effect without files", "remove it, or give files")
         if drill.links and self.mission is not None and self.mission.network is None:
             problem = "has no effect: without [network], one law knows all states"

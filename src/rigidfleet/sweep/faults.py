@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from rigidfleet._common.quantities import MOTIONS
-from rigidfleet._common.reading import Gaps, Interpolation
+from rigidfleet._common.reading import READING, Gaps, Interpolation
 from rigidfleet._common.text import first_few
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.math import proximity
@@ -40,8 +40,6 @@ PARTIAL = {"late": "s", "another": "", "stale": "", "bias": "m"}
 SETUP = {"rotated": "deg", "shifted": "m", "mirrored": "deg"}
 FLOWN = {"wind": "m/s", "links": "", "lost": ""}
 UNITS = PARTIAL | SETUP | FLOWN
-#: Keys that say how files are read.
-READING = "interpolation", "gaps", "units", "axes", "topic"
 #: Agents in a message.
 _AGENTS = re.compile(r"\bagent \d+|\bagents \d+(?:, \d+)* and \d+")
 _TURN = 2.0 * np.pi

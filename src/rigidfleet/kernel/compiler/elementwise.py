@@ -27,7 +27,6 @@ overload(distance.where, jit_options=OPTIONS)(
 )
 overload(distance.any_true, jit_options=OPTIONS)(lambda test: lambda test: test)
 overload(distance.floor, jit_options=OPTIONS)(lambda x: _floor)
-overload(distance.zero_like, jit_options=OPTIONS)(lambda x: lambda x: 0.0)
 
 for _function in distance.ELEMENTWISE:
     _register_for_jit(_function)
