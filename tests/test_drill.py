@@ -612,6 +612,10 @@ WRONG = {
     "all lost": ({"lost": [12]}, "drill.lost.*too much for 12 vehicles"),
     "its own file": ({"another": [1, 12]}, "drill.another.*too much for 12 vehicles"),
     "nothing to read": ({"units": "mm"}, "drill.units.*no effect without files"),
+    "missions only": (
+        {"axes": "ned", "stale": ["change-of-picture"]},
+        "drill.axes.*no effect without files",
+    ),
     "too many": ({"late": [1.0], "vehicles": [13]}, "drill.vehicles.*too much for 12 vehicles"),
 }
 

@@ -72,8 +72,8 @@ class FleetState:
         start = mission.fleet
         self.yaw = initial_yaw_and_rate(mission)  # asked at the last switch, and its rate
         yaw = float(self.yaw[0, 0])
-        self.S = fleet.hover_states(self.flight.vehicles, start.position, start.velocity, yaw)
-        self.state: fleet.SampledState | None = None  # of the phase before
+        self.start = fleet.hover_states(self.flight.vehicles, start.position, start.velocity, yaw)
+        self.state: fleet.SampledState | None = None  # now, or at the end of the phase before
         self.layers = layers(mission)  # settings of the clock and the body layer, if they may act
         self.output_step = mission.output_step
         self.burst = None if mission.network is None else mission.network.burst
@@ -136,7 +136,7 @@ class SampledPropagator:
         integral, before = y[6 * n : 6 * n + m], fleet_state.state
         law = plan.problem.law
         begun = fleet.initial_state(
-            self.flight, fleet_state.S, at.workspace, frame=frame,
+            self.flight, fleet_state.start if before is None else before.S, at.workspace, frame=frame,
             iterations=law.iterations if law.solver == ITERATED else 1,
         )  # fmt: skip
         if before is None:
@@ -414,7 +414,6 @@ class SampledPropagator:
             self.vehicles.tables.delay_path(late)
             plan.problem = postpone(plan.problem, late)
             plan.reference = plan.reference._replace(t0=plan.reference.t0 + late)
-        self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
         if self.leader is not None:
             self.vehicles.scale = self.leader.deviation.scale
 

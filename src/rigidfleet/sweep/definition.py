@@ -472,7 +472,7 @@ class _SweepDraft:
                 self.add((name,), "has no effect on a drill", "remove it, or [drill]")
         if drill.files and (flown := drill.model_fields_set & faults.FLOWN.keys()):
             self.add(("drill", *flown), "needs a mission that is flown", "remove it, or files")
-        if not (drill.files or drill.stale):
+        if not drill.files and all(map(faults.names_mission, drill.stale)):
             for name in drill.model_fields_set.intersection(READING):
                 self.add(("drill", name), "has no effect without files", "remove it, or give files")
         if drill.links and self.mission is not None and self.mission.network is None:

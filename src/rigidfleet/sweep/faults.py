@@ -118,6 +118,11 @@ def max_fault_sizes(n: int) -> dict[str, int]:
     return {"vehicles": n, "another": n - 1, "lost": n - 1, "links": n * (n - 1) // 2}
 
 
+def names_mission(version: str) -> bool:
+    """Whether an earlier version is a mission, which is flown, and no file of trajectories."""
+    return version in mission_names() or version.endswith(".toml")
+
+
 def random_stream(seed: int, *number: int) -> np.random.Generator:
     """Random numbers of a run or of an order of the vehicles."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=number))
@@ -241,7 +246,7 @@ class Show:
         #: The ways of earlier versions.
         self.versions = [
             self._fly_or_read_ways(load_mission(name), ())[0]
-            if name in mission_names() or name.endswith(".toml")
+            if names_mission(name)
             else self._fly_or_read_ways(mission, (name,))[0]
             for name in drill.stale
         ]
