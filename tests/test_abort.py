@@ -390,7 +390,7 @@ def test_a_wreck_on_the_own_place_is_said_to_stand_in_the_way(to: str, home: boo
     if home:
         assert np.abs(result.position[-1, 1, :2]).max() < 1e-3
     else:
-        assert "'lost agent 1' stands in the way down of agent 2" in result.ending
+        assert "'lost agent 1' stands in the way of agent 2 on the way down" in result.ending
         assert "lost agent 1' stands in the way" in str([x.text for x in rf.check(mission).remarks])
 
 

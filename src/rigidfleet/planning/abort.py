@@ -425,7 +425,10 @@ class Aborts:
         limits, left, radius = self.mission.limits, self.left, self.radius[self.left]
         along = step.path is not None
         astray = 0.0 if along else 0.5 * step.off  # how far each may be off its way in flight
-        way, on = step.way, f"on the way {step.name}"
+        way = step.way
+        on = {"slow down": "while slowing down", "leave": "on leaving"}.get(
+            step.name, f"on the way {step.name}"
+        )
         if not along and (apart := step.least.separation - step.off) < max(self.need, 1e-6):
             # On their pads vehicles may be nearer.
             both, pads = way.at(np.zeros(1))[0, list(step.least.agents), 2], limits.separation_altitude  # fmt: skip
@@ -469,7 +472,7 @@ class Aborts:
             k, i = np.unravel_index(int(room.argmin()), room.shape)
             if room[k, i] < _PACE:  # less than half the way between two samples
                 thing = things[int(near[k, i])].name
-                return f"'{thing}' stands in the way {step.name} of agent {left[i] + 1}"
+                return f"'{thing}' stands in the way of agent {left[i] + 1} {on}"
         return ""
 
     def _prove_ways(self, way: Piecewise, who: Ints, with_first: int | None = None) -> Certificate:
