@@ -185,6 +185,28 @@ def test_two_hundred_aborts_keep_their_promise_in_flight(rotors: bool, none: int
     assert np.isinf(margins).sum() == none
 
 
+@pytest.mark.parametrize("apart", [1.5, 3.0, 6.0])
+def test_vehicles_that_drag_holds_back_get_a_wider_grid_to_land_on(apart: float) -> None:
+    """From a start in the air, ways home keep the separation in flight however far apart vehicles begin."""
+    start = np.array([[0.0, 0, 5], [apart, 0, 5], [0, apart, 5]])
+    mission = Mission.from_dict(
+        {
+            "schema_version": 1, "name": "grid", "smoothness": "jerk", "vehicles": {"q": {"model": "paper"}},
+            "agents": {"vehicle": "q", "position": start.tolist(), "radius": 0.25}, "limits": {"separation": 0.5},
+            "obstacles": [{"kind": "ground", "name": "ground"}], "formations": {"f": {"slots": start.tolist()}},
+            "phases": [
+                {"kind": "establish", "formation": "f", "duration": 4},
+                {"kind": "go", "position": [10, 0, 5], "duration": 15},
+            ],
+        }
+    )  # fmt: skip
+    abort = aborts_of(mission).abort_at(10.0)
+    assert abort.home.way == "to any place", abort.home.reason
+    verdict = rf.assess(rf.simulate(Mission.from_dict(mission.to_dict() | {"abort": {"at": 10.0}})))
+    assert verdict.by_name["way_home"].passed, verdict.summary
+    assert verdict.by_name["separation"].passed, verdict.summary
+
+
 @pytest.mark.parametrize("to", ["any", "own"])
 def test_every_second_has_a_way_home_and_no_two_come_nearer(to: str) -> None:
     """Samples of every second's abort come as near as proved, to a millimetre, and no nearer; all stand on places."""

@@ -520,12 +520,14 @@ class Aborts:
             reason = "there is no ground to land on: add [[obstacles]] with kind = 'ground'"
         if reason:
             return Home(reason=reason)
-        reasons, off = [], 0.0
-        # Levels are tried again with as much more between them as vehicles were off their ways.
+        reasons: dict[str, str] = {}
+        off = 0.0
+        # Tried again with as much more between levels, or in the grid, as vehicles were off their ways.
         own = "straight to their own", "by levels", "by levels"
-        for way in ("to any place",) if self.to == "any" else own:
+        for way in ("to any place",) * (2 - self.stands) if self.to == "any" else own:
             steps: list[Step] = []
             problem, t = "", begin
+            goal[left] = self.landing_places(r, off)[left]
             for name, a, b in self._landing_step_ends(way, r, goal, off):
                 if np.abs(b - a).max() > 1e-9:
                     steps.append(self._straight_step(name, a, b))
@@ -534,8 +536,8 @@ class Aborts:
             if not problem:
                 return Home(tuple(steps), way)
             off = max(step.off for step in steps)
-            reasons.append(f"{way}: {problem}")
-        return Home(reason="; ".join(reasons))
+            reasons[way] = problem
+        return Home(reason="; ".join(f"{way}: {problem}" for way, problem in reasons.items()))
 
     def _landing_step_ends(
         self, way: str, r: Floats, goal: Floats, off: float
@@ -573,14 +575,15 @@ class Aborts:
         own[taken[:count]] = spare[:count]
         return own
 
-    def landing_places(self, r: Floats) -> Floats:
+    def landing_places(self, r: Floats, off: float = 0.0) -> Floats:
         """Landing places (N, 3) [m] of the vehicles' centres.
 
-        Where they stood at the start; if they did not stand on the ground, a square grid below where they stop.
+        Where they stood at the start; if they did not stand on the ground, a square grid below where they stop, for
+        vehicles that are ``off`` their ways [m].
         """
         if self.stands:
             return self.start
-        n, near, apart = len(r), math.inf, self.apart
+        n, near, apart = len(r), math.inf, self.apart + off
         if len(self.left) > 1:
             near = float(proximity.nearest(r[self.left]).min())
         wide = near / math.sqrt(max(near**2 - apart**2, 0.1 * near**2)) if near < math.inf else 1.0
