@@ -1,5 +1,6 @@
 """The leg of a phase: what is planned before a flight is what the flight follows, and is planned once."""
 
+import json
 from collections import Counter
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 import rigidfleet as rf
+from rigidfleet.cli.app import main
 from rigidfleet.math import attitude
 from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import KINDS
@@ -203,10 +205,13 @@ class Draw:
         if self.formed and self.likely(0.6):
             starts, self.formed = list(self.place + own - own.mean(axis=0)), False
         bend = self.rng.uniform(-0.05, 0.05, 3)
-        rows = [
-            [[8.0, *(c for x, b in zip(start, bend, strict=True) for c in (x, 0.0, b)), 0, 0, 0]]
-            for start in starts
-        ]
+        degree = int(self.rng.spawn(1)[0].choice([0, 2, 3, 5, 7]))  # 0: it stays
+        rows = []
+        for start in starts:
+            curve = np.zeros((4, degree + 1))
+            curve[:3, -1] = bend / 8.0 ** (degree - 2)
+            curve[:3, 0] = start
+            rows.append([[8.0, *curve.ravel().tolist()]])
         self.add(kind="follow", trajectories=rows)
         self.rest()
 
@@ -274,6 +279,96 @@ def test_two_hundred_drawn_missions_follow_the_legs_that_their_checks_plan():
     assert sum(bool(p.auto_keys) for mission in missions for p in mission.phases) > 100
     assert sum(not p.flown_as_written for mission in missions for p in mission.phases) > 20
     assert sum(mission.on_loss != "continue" for mission in missions) > 40
+
+
+@pytest.mark.parametrize(
+    "seed", [*range(6), *(pytest.param(k, marks=pytest.mark.long) for k in range(6, 60))]
+)
+def test_a_drawn_mission_is_timed_once_and_checked_alike_by_all(seed, tmp_path, capsys):
+    """Times that are known stay, and the command, `check` and the check of what it has checked say the same."""
+    mission = Draw(seed).mission()
+    timed = complete_times(mission)
+    assert [phase.model_dump() for phase in complete_times(timed).phases] == [
+        phase.model_dump() for phase in timed.phases
+    ]
+    once = rf.check(mission)
+    again = rf.check(once.mission)
+    assert [str(x) for x in once.remarks] == [str(x) for x in again.remarks]
+    path = tmp_path / "drawn.toml"
+    path.write_text(mission.text)
+    assert main(["check", str(path), "--json"]) == (0 if once.passed else 1)
+    assert json.loads(capsys.readouterr().out)["passed"] == once.passed
+
+
+SHORT: dict[str, tuple[list[Any], Any]] = {
+    "begins slowly": ([0.05], "auto"),
+    "begins at rest": ([0.0, 0.1], "auto"),
+    "stays": ([], "auto"),
+    "stays for its time": ([], 5.0),
+    "begins at a speed": ([0.1], 5.0),
+}
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_short_trajectories_are_judged_alike_before_and_in_flight(name):
+    """Of trajectories of few coefficients, check and flight say the same: they pass, or why they cannot be flown."""
+    rates, duration = SHORT[name]
+    curve = [
+        5.0,
+        1.5,
+        *rates,
+        0,
+        *(0 for _ in rates),
+        5,
+        *(0 for _ in rates),
+        0,
+        *(0 for _ in rates),
+    ]
+    phases = [
+        {"kind": "establish", "formation": "pair", "duration": 5.0},
+        {"kind": "follow", "trajectories": [[curve]], "duration": duration},
+        {"kind": "fly", "position": [4, 0, 5], "duration": "auto"},
+    ]
+    mission = Mission.from_dict(
+        {
+            "schema_version": 1, "name": "short", "smoothness": "jerk", "limits": {"speed": 3.0, "acceleration": 2.0},
+            "agents": {"mass": 1.0, "radius": 0.2, "position": [[0, 0, 5], [3, 0, 5]]},
+            "formations": {"pair": {"slots": [[0, 0, 0], [3, 0, 0]]}}, "phases": phases,
+        }
+    )  # fmt: skip
+    says = []
+    for judge in (lambda: rf.check(mission), lambda: rf.assess(rf.simulate(mission))):
+        try:
+            says.append(str(judge().passed))
+        except rf.MissionError as error:
+            says.append(str(error))
+    assert says[0] == says[1]
+
+
+#: Agent 1 is lost on its way down, while the centre of mass would have to be led after it.
+LANDS_ALONE = {
+    "schema_version": 1, "name": "alone", "smoothness": "jerk", "obstacles": [{"kind": "ground"}],
+    "agents": {"mass": 1.0, "radius": 0.2, "position": [[0, 0, 5], [3, 0, 5]]},
+    "formations": {"pair": {"slots": [[0, 0, 0], [3, 0, 0]]}},
+    "limits": {"speed": 3.0, "acceleration": 2.0, "separation": 0.3},
+    "phases": [
+        {"kind": "establish", "formation": "pair", "duration": 5.0},
+        {"kind": "land", "agents": [1], "duration": "auto"},
+        {"kind": "fly", "position": [8, 0, 6], "duration": "auto"},
+    ],
+    "disturbances": {"lost": [{"agent": 1, "time": 6.0}], "on_loss": "land", "landing_formation": "pair"},
+}  # fmt: skip
+
+
+def test_what_a_loss_keeps_from_being_flown_does_not_fail_a_check():
+    """Of vehicles that are lost no limit is asked, and of phases that are abandoned there are notes."""
+    mission = Mission.from_dict(LANDS_ALONE)
+    assert rf.check(mission).passed
+    for seed in (3027, 3067, 3081, 3096, 3117):
+        mission = Draw(seed).mission()
+        ahead = rf.check(mission)
+        verdict = rf.assess(rf.simulate(mission))
+        assert ahead.passed == verdict.passed, (seed, ahead.remarks, verdict.summary)
 
 
 # -- once a phase -----------------------------------------------------------------------------------------

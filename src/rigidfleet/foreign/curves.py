@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.math.piecewise import Piecewise
+from rigidfleet.math.piecewise import Piecewise, pad
 from rigidfleet.typing import Floats, Ints
 
 #: Names of the channels of a curve.
@@ -103,7 +103,8 @@ def rows_to_curve(rows: ArrayLike) -> Piecewise:
     """The curve of rows of one length: a duration [s], and the coefficients of x, y, z and yaw."""
     table = np.array(rows, dtype=np.float64)
     time = np.concatenate([[0.0], np.cumsum(table[:, 0])])
-    return Piecewise(time, table[:, 1:].reshape(len(table), CHANNELS, -1))
+    pieces = table[:, 1:].reshape(len(table), CHANNELS, -1)
+    return Piecewise(time, pad(pieces, max(2, pieces.shape[-1])))  # one that stays has a slope, too
 
 
 def curve_to_rows(curve: Piecewise) -> list[list[float]]:

@@ -719,11 +719,11 @@ def shortest_time(
     return min(tries, key=lambda x: x[1].max())
 
 
-def capped_limits(mission: Mission, **most: float) -> list[Limit]:
-    """The limits of a mission, of which some are no greater than given here."""
+def capped_limits(mission: Mission, lost_by: float = -math.inf, **most: float) -> list[Limit]:
+    """The limits of a mission, of which some are no greater than given here; for ``lost_by`` see `limits_of`."""
     own = mission.limits
     less = {name: min(x, getattr(own, name) or x) for name, x in most.items()}
-    return limits_of(mission, own.model_copy(update=less))
+    return limits_of(mission, own.model_copy(update=less), lost_by=lost_by)
 
 
 def _altitude_levels(distance: float, p: Floats, q: Floats) -> Ints:

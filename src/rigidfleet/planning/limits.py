@@ -59,13 +59,15 @@ def limits_of(
     limits: Limits | None = None,
     reserve: Floats | None = None,
     kept_if_unlimited: Collection[str] = (),
+    lost_by: float = -np.inf,
 ) -> list[Limit]:
     """The limits that a mission sets to its references, or other ``limits`` in place of its own.
 
     Quantities ``kept_if_unlimited`` by name are there without a limit, too: it is then infinite.
     With ``reserve`` (N,) [s], quantities are the greatest that vehicles reach (`planning.vehicles.tracking_lag_times`).
+    Vehicles that are ``lost_by`` a time [s] have none.
     """
-    limits, n = limits or mission.limits, mission.n_agents
+    limits, lost = limits or mission.limits, mission.lost_at <= lost_by
     mass, up = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
 
     def lag_overshoot(derivative: int, states: Floats, who: Ints) -> Floats | float:
@@ -92,7 +94,7 @@ def limits_of(
     for q in (*MOTIONS, QUANTITIES["tilt"], QUANTITIES["thrust"]):
         table, _, key = q.key.partition(".")
         most = mission.fleet.thrust_limit if table == "agents" else getattr(limits, key)
-        most = np.broadcast_to(np.asarray(np.inf if most is None else most, dtype=float), n)
+        most = np.where(lost, np.inf, np.inf if most is None else most)
         if q.name in kept_if_unlimited or np.isfinite(most).any():
             finite.append(Limit(q, most, partial(ways.get(q.way, motion_with_overshoot), q)))
     return finite
@@ -116,9 +118,11 @@ def use_of_limits(
         who = np.arange(first, min(first + step, n))
         x = slot_derivatives(reference_of_agents(reference, who), motion, time, 4)
         for k, limit in enumerate(limits):
-            if not np.isfinite(limit.most[who]).any():
+            limited = np.isfinite(limit.most[who])
+            if not limited.any():
                 continue
-            highest = _greatest_share(limit, reference, motion, time, x, who, fine=fine)
+            own, some = (x, who) if limited.all() else (x[:, :, limited], who[limited])
+            highest = _greatest_share(limit, reference, motion, time, own, some, fine=fine)
             if k not in best or highest.share > best[k].share:
                 best[k] = highest
     return [best[k] for k in sorted(best)]

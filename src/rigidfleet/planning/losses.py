@@ -162,7 +162,7 @@ def _quickest_leg(
 
     Where the state at the start is beyond a limit, that counts as the limit. If no time keeps them, the best one tried.
     """
-    limits = capped_limits(mission, acceleration=BRAKING, jerk=JERK)
+    limits = capped_limits(mission, lost_by=now.t, acceleration=BRAKING, jerk=JERK)
     departure = depart(mission, make(least), now)
 
     def limit_shares(time: float, end: float = math.inf) -> Floats:

@@ -67,7 +67,8 @@ def can_affect_plan(mission: Mission, keys: Keys) -> bool:
 def complete_times(mission: Mission) -> Mission:
     """Return a mission whose transitions and ways are phases of their own (`expand_mission`), with its times known.
 
-    Automatic times are replaced by the least ones. A mission with neither is returned as it is.
+    Automatic times are replaced by the least ones. A mission with neither, or whose times are known, is returned as it
+    is.
 
     Times follow from the planned state at the start of each phase; a phase before that ends by settling is assumed to
     have arrived. The text is that of `expand_mission`, so that a result repeats from it.
@@ -85,7 +86,7 @@ def complete_times(mission: Mission) -> Mission:
     )
     if last is None:
         return mission
-    tables = mission.to_dict()["phases"]
+    changes: dict[int, dict[str, Any]] = {}
     now = state_at_start(mission)
     for k, phase in enumerate(mission.phases[: last + 2]):
         if problem := moving_slots_conflict_text(phase, now):
@@ -96,8 +97,8 @@ def complete_times(mission: Mission) -> Mission:
         report_step(f"timing '{phase.name}'")
         leg = timed_leg(mission, phase, now, k)
         if leg.phase is not phase:
-            changed = leg.phase.model_dump(mode="json", include={*phase.auto_keys, "through"})
-            tables[k] = tables[k] | {key: x for key, x in changed.items() if x or key != "through"}
+            times = leg.phase.model_dump(mode="json", include={*phase.auto_keys, "through"})
+            changes[k] = {key: x for key, x in times.items() if x or key != "through"}
         if not leg.has_known_ways:
             problem = "depends on distances alone, so that the starts of later phases are known only in flight"
             name = None if phase.shaping is None else phase.shaping.formation
@@ -106,7 +107,10 @@ def complete_times(mission: Mission) -> Mission:
             )
             raise ways.error_of_key(mission, k, "formation", name, problem, remedy)
         now = leg.planned_end_state
-    return mission.with_phases(tables)
+    if not changes:  # its times may be known already, while its text has the automatic ones
+        return mission
+    tables = mission.to_dict()["phases"]
+    return mission.with_phases([x | changes.get(k, {}) for k, x in enumerate(tables)])
 
 
 def timed_leg(
@@ -122,10 +126,14 @@ def timed_leg(
         No time keeps the limits, or the phase follows given ways that begin elsewhere.
     """
     departure = depart(mission, phase, now)
-    if not anywhere and (problem := way_conflict_text(phase, departure.now)):
-        key = "file" if phase.follows_curves else "formation"
-        remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
-        raise ways.error_of_key(mission, number, key, None, problem, remedy)
+
+    def refuse_conflicts(phase: Phase) -> None:
+        if not anywhere and (problem := way_conflict_text(phase, departure.now)):
+            key = "file" if phase.follows_curves else "formation"
+            remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
+            raise ways.error_of_key(mission, number, key, None, problem, remedy)
+
+    refuse_conflicts(phase)
     if not phase.auto_keys:
         return leg_from(mission, phase, departure)
     phase = _with_point_times(mission, phase, departure)
@@ -140,7 +148,9 @@ def timed_leg(
         raise ways.error_of_key(mission, number, phase.auto_keys[0], AUTO, problem, remedy)
     if time > shortest:
         time = math.ceil(time * _MARGIN / _UNIT - 1e-9) * _UNIT
-    return leg_from(mission, vary(round(time, 6)), departure)
+    timed = vary(round(time, 6))
+    refuse_conflicts(timed)  # it may begin faster than its file
+    return leg_from(mission, timed, departure)
 
 
 def key_and_least_time(mission: Mission, leg: Leg) -> tuple[str, float | None]:
@@ -158,7 +168,8 @@ def broken_limits(mission: Mission, leg: Leg) -> list[Reached]:
     """Limits that the reference of a planned leg breaks, the worst first."""
     if not leg.phase.tracks_slots:
         return []
-    over = use_of_limits(limits_of(mission), leg.reference, leg.motion, leg.start, leg.end)
+    limits = limits_of(mission, lost_by=leg.start)
+    over = use_of_limits(limits, leg.reference, leg.motion, leg.start, leg.end)
     return sorted((x for x in over if x.share > 1.0 + SLACK), key=lambda x: -x.share)
 
 

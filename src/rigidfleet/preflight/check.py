@@ -22,7 +22,7 @@ from rigidfleet.preflight.avoidance import avoidance_remarks
 from rigidfleet.preflight.findings import Preflight, Remark
 from rigidfleet.preflight.formations import SEARCHED, check_formations, formation_remarks
 from rigidfleet.preflight.gains import check_pid_gains, gain_remarks
-from rigidfleet.preflight.losses import loss_remarks
+from rigidfleet.preflight.losses import loss_remarks, parts_before_and_after_loss
 from rigidfleet.preflight.margins import check_margins, loop_remarks
 from rigidfleet.preflight.network import check_network, network_remarks
 from rigidfleet.preflight.obstacles import area_remarks, obstacle_remarks
@@ -57,7 +57,8 @@ def check(
     formations = check_formations(mission, search=search, progress=progress)
     progress("planned paths")
     planned, known = preview_phases(mission)
-    preflight = Preflight(mission, formations, check_pid_gains(mission, formations), planned)
+    flown, rest = parts_before_and_after_loss(mission, planned)
+    preflight = Preflight(mission, formations, check_pid_gains(mission, formations), flown)
     trajectory.find_planned_peaks(mission, preflight)
     if not known:
         preflight.judged_to = float(planned[-1].time[-1]) if planned else 0.0
@@ -65,7 +66,7 @@ def check(
         progress("margins")
         preflight.margins = check_margins(mission, planned, lags)
         preflight.network = check_network(mission, planned, lags)
-        preflight.vehicles = check_vehicles(mission, planned)
+        preflight.vehicles = check_vehicles(mission, flown)
         preflight.reserve = float(tracking_lag_times(mission).max()) if mission.smooth else 0.0
     progress("collisions, obstacles and limits")
     preflight.remarks = [
@@ -86,9 +87,10 @@ def check(
         *area_remarks(mission, preflight),
         *trajectory.limit_remarks(mission, preflight),
         *trajectory.waypoint_miss_remarks(mission, preflight),
-        *loss_remarks(mission, preflight),
+        *loss_remarks(mission, preflight, planned, rest),
     ]
-    if planned and (words := mission.landing_swaps_in_words(planned[-1].position[-1])):
+    preflight.planned_phases = planned
+    if planned and not rest and (words := mission.landing_swaps_in_words(planned[-1].position[-1])):
         preflight.remarks.append(Remark("note", "landing", words))
     if not known:
         why = "later positions depend on distances alone and are known only in flight"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,13 +26,39 @@ from rigidfleet.preflight.trajectory import downwash_remarks, limit_remarks, sep
 from rigidfleet.rigidity import analyse
 
 
-def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
-    """Remarks on lost links, and on the way of those left after the first loss."""
+def parts_before_and_after_loss(
+    mission: Mission, planned: Sequence[PlannedPhase]
+) -> tuple[list[PlannedPhase], list[PlannedPhase]]:
+    """Planned phases up to when the flight leaves its plan, and those after it, which are not flown."""
+    first = mission.abandons_at
+    flown = [x for x in planned if x.leg.end <= first]
+    rest = [x for x in planned if x.leg.start >= first]
+    if cut := [x for x in planned if x.leg.start < first < x.leg.end]:
+        for part, k, ends in (flown, len(flown), {"end": first}), (rest, 0, {"start": first}):
+            leg = copy(cut[0].leg)
+            vars(leg).update(ends)  # its motion stays
+            part.insert(k, replace(sample_leg(leg, len(cut[0].time)), path_ends=None))
+    return flown, rest
+
+
+def loss_remarks(
+    mission: Mission,
+    preflight: Preflight,
+    planned: Sequence[PlannedPhase],
+    rest: list[PlannedPhase],
+) -> Iterator[Remark]:
+    """Remarks on lost links, and on the way of those left after the first loss.
+
+    Of the phases ``planned``, the ``rest`` is not flown: notes say what would fail.
+    """
     yield from _lost_link_remarks(mission)
     first = mission.abandons_at
     if not np.isfinite(first):
         return
-    legs = [planned.leg for planned in preflight.planned_phases]
+    for remark in _path_remarks(mission, preflight, rest):
+        text = f"{remark.text}. The flight leaves its plan before, at {first:g} s"
+        yield Remark("note", remark.topic, text)
+    legs = [phase.leg for phase in planned]
     at = next((x for x in legs if x.start < first <= x.end), None)
     ordered = mission.aborts and mission.on_loss == "continue"
     if at is None:
@@ -52,17 +80,26 @@ def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     )
     yield Remark("note", "loss", text)
     most = max(samples_per_phase(mission), FEWEST_SAMPLES)
-    part = Preflight(
-        mission, preflight.formations, preflight.gains, [sample_leg(x, most) for x in way]
-    )
+    phases = [sample_leg(x, most) for x in way]
+    yield from _path_remarks(mission, preflight, phases)
+    aborts = Aborts(mission, legs, mission.lost_at <= first)
+    # Where the loss comes after a phase that ends by settling, where it falls is an estimate.
+    settles = any(x.phase.settle is not None for x in legs if x.start < first)
+    yield from _wreck_remarks(aborts, phases, exact=not settles)
+
+
+def _path_remarks(
+    mission: Mission, preflight: Preflight, planned: list[PlannedPhase]
+) -> Iterator[Remark]:
+    """Remarks on the paths of phases that are planned beside those of the flight."""
+    part = Preflight(mission, preflight.formations, preflight.gains, planned)
     for judge in (
         separation_remarks, downwash_remarks, obstacle_remarks, area_remarks, limit_remarks,
     ):  # fmt: skip
         yield from judge(mission, part)
-    yield from _wreck_remarks(Aborts(mission, legs, mission.lost_at <= first), part.planned_phases)
 
 
-def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
+def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase], *, exact: bool) -> Iterator[Remark]:
     """Remarks on those left who hit a lost vehicle that falls or lies, at samples of the way after the loss."""
     left, radius = aborts.left, aborts.radius[aborts.left] - aborts.fall_uncertainty.max()
     for planned in way if aborts.wrecks else ():
@@ -71,8 +108,9 @@ def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase]) -> Iterator[Rema
         k, i = np.unravel_index(int(room.argmin()), room.shape)
         if room[k, i] < 0.0:
             wreck = aborts.wrecks[int(near[k, i])].name
-            text = f"agent {left[i] + 1} hits '{wreck}' at {time[k]:.2f} s in '{planned.phase}'"
-            yield Remark("fails", "loss", text)
+            hits = "hits" if exact else "may hit"
+            text = f"agent {left[i] + 1} {hits} '{wreck}' at {time[k]:.2f} s in '{planned.phase}'"
+            yield Remark("fails" if exact else "note", "loss", text)
 
 
 def planned_answer_to_loss(mission: Mission, at: Leg, legs: Sequence[Leg]) -> Answer:

@@ -153,6 +153,8 @@ def find_planned_peaks(mission: Mission, preflight: Preflight) -> None:
         if way:
             states = (_planned_states_up_to_order(planned, q.order) for planned in way)
             values = [limit.values(x, np.arange(mission.n_agents)) for x in states]
+            for planned, x in zip(way, values, strict=True):
+                x[planned.time[:, None] > mission.lost_at] = -np.inf
             preflight.worst[q.name] = _worst_value_when_who_limit(way, values, limit.most)
 
 
@@ -308,7 +310,7 @@ def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark
 def _broken_limit_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
     """Remarks on speed, acceleration and thrust of samples beyond their limits."""
     x = _planned_states_up_to_order(planned, 2)
-    for limit in limits_of(mission):
+    for limit in limits_of(mission, lost_by=planned.leg.start):
         q = limit.of
         if q.order > 2 or q.name == "tilt":
             continue
