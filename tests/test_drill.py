@@ -628,7 +628,7 @@ def test_what_cannot_be_drilled_is_refused(name):
 
 
 def test_a_flight_that_fails_anyway_is_not_drilled(tmp_path, capsys, monkeypatch):
-    """A mission that fails without any fault is refused with its failure; limits of others' files need --drill and files."""
+    """A mission that fails without any fault is refused with its failure; limits of others' files need such files."""
     monkeypatch.chdir(tmp_path)
     assert main(["sweep", "establish-cube-as-printed", "--drill", "--quiet"]) == 2
     assert "fails without any fault" in capsys.readouterr().err
