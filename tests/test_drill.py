@@ -632,12 +632,14 @@ def test_what_cannot_be_drilled_is_refused(name):
 
 
 def test_a_flight_that_fails_anyway_is_not_drilled(tmp_path, capsys, monkeypatch):
-    """A mission that fails without any fault is refused with its failure; limits of others' files need --drill."""
+    """A mission that fails without any fault is refused with its failure; limits of others' files need such files."""
     monkeypatch.chdir(tmp_path)
     assert main(["sweep", "establish-cube-as-printed", "--drill", "--quiet"]) == 2
     assert "fails without any fault" in capsys.readouterr().err
     assert main(["sweep", "change-of-picture", "--drill", "--separation", "1"]) == 2
     assert "--separation" in capsys.readouterr().err
+    assert main(["sweep", "none.skyc", "--drill", "--separation", "1"]) == 2
+    assert "none.skyc: no such file" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")

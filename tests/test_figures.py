@@ -518,6 +518,8 @@ def test_a_force_that_is_rounding_is_told_in_words():
     assert f"only rounding errors: at most 3.03e-08 N, agent 3 at {t[100]:.2f} s" in texts(figure)
     assert f"only rounding errors: at most 2e-08 N, edge 1-3 at {t[90]:.2f} s" in texts(figure)
     assert not any(ax.yaxis.get_tick_params()["labelleft"] for ax in figure.axes)
+    nothing = a_flight(constraint_force=0.0 * force, multiplier=0.0 * tension)
+    assert texts(plotting.constraint_force(nothing)).count("0 N throughout") == 2
 
 
 def test_a_small_force_fills_its_axes():
@@ -590,6 +592,11 @@ def test_what_stands_still_is_told_in_words(triangle):
     )
     figure = drawn("cm", flight)
     assert "3 m throughout, within 4e-08" in texts(figure)
+    words = [text for ax in figure.axes for text in ax.texts if "throughout" in text.get_text()]
+    for text in words:  # above the rings of waypoints, which have a radius of 2.5 points
+        box, ax = text.get_window_extent(), text.axes
+        line = ax.transAxes.transform((0.0, 0.5))[1]
+        assert line + 3 * figure.dpi / 72 < box.y0 < box.y1 < ax.bbox.y1
     assert "1 m/s throughout" in texts(figure)
     assert texts(figure).count("0 m/s throughout") == 2
     x, speed_x, y, _, z, _ = figure.axes
@@ -804,11 +811,12 @@ def test_nothing_covers_a_formation(shape):
 
 
 def test_names_of_axes_stand_off_their_numbers():
-    """In a long and flat scene too, the name of an axis in space covers none of its numbers."""
+    """In a long and flat scene too, and at night, the name of an axis in space covers none of its numbers."""
     flight = a_flight()
     place = flight.position * [3.0, 0.4, 0.3]
-    figure = drawn("trajectory", replace(flight, position=place, cm=place.mean(axis=1)))
-    for axis in (figure.axes[0].xaxis, figure.axes[0].yaxis):
+    flat = drawn("trajectory", replace(flight, position=place, cm=place.mean(axis=1))).axes[0]
+    lights = drawn("trajectory", simulate(load_mission("change-of-picture"))).axes[0]
+    for axis in (flat.xaxis, flat.yaxis, lights.xaxis, lights.yaxis, lights.zaxis):
         name = corners(axis.label)
         numbers = [corners(tick.label1) for tick in axis.get_major_ticks()]
         assert not any(overlap(name, number) for number in numbers)
@@ -830,6 +838,17 @@ def test_errors_are_named_by_what_is_drawn(edges):
     words = " ".join(texts(drawn("constraint_error", flight)))
     assert ("edge" in words or "Constraint" in words) == edges
     assert "error of all pairs" in words
+
+
+def test_a_shape_without_any_error_is_told_in_words():
+    """Slots that are met to the bit have errors of zero, which no axis of logarithms has."""
+    slots = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
+    flight = a_flight(
+        formation={"slots": slots.tolist(), "edges": []},
+        position=np.broadcast_to(slots, (181, 3, 3)),
+        slot_position=np.broadcast_to(slots, (181, 3, 3)),
+    )
+    assert "0 m throughout" in texts(plotting.constraint_error(flight))
 
 
 def test_every_formation_of_the_mission_is_drawn():
@@ -1178,9 +1197,12 @@ def test_the_summary_is_on_the_page(flight):
         assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1, ax.get_ylabel()
 
 
-@pytest.mark.parametrize("flight", ["market-square", "lossy-passage", "statue"])
+@pytest.mark.parametrize("flight", ["hill-search", "market-square", "lossy-passage", "statue"])
 def test_names_of_waypoints_stay_in_the_view_from_above(flight):
-    """With their outlines of 1.25 points, whether their waypoints are near its right side or its upper one."""
+    """With their outlines of 1.25 points, whether their waypoints are near its right side or its upper one.
+
+    None covers another one.
+    """
     figure = drawn("summary", simulate(load_mission(flight)))
     above = figure.axes[1]
     names = [text for text in above.texts if isinstance(text, Annotation)]
@@ -1189,6 +1211,8 @@ def test_names_of_waypoints_stay_in_the_view_from_above(flight):
         box = name.get_window_extent().padded(1.25 * figure.dpi / 72)
         assert (box.min >= above.bbox.min).all(), name.get_text()
         assert (box.max <= above.bbox.max).all(), name.get_text()
+        others = [x.get_window_extent() for x in names if x is not name]
+        assert not name.get_window_extent().count_overlaps(others), name.get_text()
 
 
 def test_a_legend_has_each_look_of_fences_once():

@@ -494,6 +494,7 @@ def test_a_copy_has_nothing_that_follows_from_what_is_changed():
         (("title", "two\nlines"), "title", "characters", "one line"),
         (("architecture", "locl"), "architecture", "'local' or 'body'", "did you mean 'local'?"),
         (("gravity", "9.81"), "gravity", "must be a number", "[m/s^2]"),
+        (("phases/0/blend", "4 s"), "phases[1].blend", "must be numeric, or 'auto'", "[s]"),
         (("gravity", True), "gravity", "must be a number", "[m/s^2]"),
         (("gravity", math.nan), "gravity", "must be finite", "[m/s^2]"),
         (("gravity", 10**400), "gravity", "must be", "[m/s^2]"),

@@ -217,7 +217,7 @@ def _sweep_and_folder(
         return definition, here
     named = what in mission_names()
     others = keys["drill"] is not None and not named and here.suffix != ".toml" and here.exists()
-    if of_others and not others:
+    if of_others and not others and (named or here.exists()):
         raise RigidfleetError(
             f"--{next(iter(of_others))}: is of others' trajectories, by --drill; a mission has its own. Remove it."
         )

@@ -236,7 +236,9 @@ def _problem_and_remedy(error: Any, path: Keys, owner: type[Part]) -> tuple[str,
             words = re.findall(r"'([^']*)'", context["expected"]) or [context["expected"]]
             suggestion = rename_hint(name, error["input"]) or suggest(error["input"], words)
             usual = "none" if error["input"] in _OFF and "none" in words else words[0]
-            return f"must be {context['expected']}", suggestion or f"use {usual}"
+            number = "numeric, or " * (error["loc"][-1] == "word")  # a word in place of a value
+            remedy = suggestion or (meaning if number else f"use {usual}")
+            return f"must be {number}{context['expected']}", remedy
         case "greater_than_equal" if 0 < context["ge"] < 1 and not error["input"] > 0:
             return "must be > 0", meaning
         case "too_short" if context["min_length"] == 1:

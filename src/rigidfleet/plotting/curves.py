@@ -369,7 +369,6 @@ def draw_constraint_error(ax: Axes, result: Result) -> list[Line2D]:
     if not handles:
         st.mark_empty(ax, "neither edges nor slots")
         return []
-    ax.set_yscale("log", nonpositive="clip")
     seen = np.concatenate([size.ravel(), shape])
     seen = seen[np.isfinite(seen)]
     large = seen[seen > _SMALLEST]
@@ -377,7 +376,9 @@ def draw_constraint_error(ax: Axes, result: Result) -> list[Line2D]:
         ax.set_ylim(max(_SMALLEST, 0.5 * float(large.min())), 3 * float(large.max()))
     else:
         ax.set_ylim(_SMALLEST, 1.0)
-        st.mark_empty(ax, f"only rounding errors: at most {seen.max():.1g} m")
+        words = f"only rounding errors: at most {seen.max():.1g} m"
+        st.mark_empty(ax, words if seen.max() else "0 m throughout")
+    ax.set_yscale("log", nonpositive="clip")  # with limits, as zeros alone have none
     return handles
 
 

@@ -108,8 +108,9 @@ class Panel:
         k, i = np.unravel_index(int(size.argmax()), size.shape) if size.size else (0, 0)
         if not size.size or not np.isfinite(size[k, i]) or size[k, i] > IDLE:
             return False
-        where = f", {self.name(int(i))} at {self.result.time[k]:.2f} s" if size[k, i] else ""
-        st.mark_empty(self.ax, f"only rounding errors: at most {size[k, i]:.3g} {self.unit}{where}")
+        where = f"{self.name(int(i))} at {self.result.time[k]:.2f} s"
+        words = f"only rounding errors: at most {size[k, i]:.3g} {self.unit}, {where}"
+        st.mark_empty(self.ax, words if size[k, i] else f"0 {self.unit} throughout")
         return True
 
     def crop_final_peak(self) -> None:

@@ -91,14 +91,17 @@ def _waypoints(result: Result) -> list[tuple[str, Floats]]:
 
 
 def _waypoint_names_by_place(view: Scene, axes: int) -> list[tuple[str, Floats]]:
-    """Names of the waypoints, of those joined that are at one place as it is seen in 2 or 3 axes."""
+    """Names of the waypoints, of those joined that are at one place as it is seen in 2 or 3 axes.
+
+    Several waypoints of one name have it at the last one.
+    """
     near = _ONE_PLACE * np.linalg.norm(view.high - view.low)
     joined: list[tuple[list[str], Floats]] = []
-    for name, place in view.waypoints:
+    for name, place in dict(view.waypoints).items():
         there = (names for names, at in joined if np.linalg.norm((at - place)[:axes]) < near)
         if (names := next(there, None)) is None:
             joined.append(([name], place))
-        elif name not in names:
+        else:
             names.append(name)
     return [(", ".join(names), place) for names, place in joined]
 
@@ -213,6 +216,7 @@ def draw_trajectory_in_space(
         walls: tuple[Any, ...] = (ax.xaxis, ax.yaxis, ax.zaxis)
         for wall in walls:
             wall.set_pane_color(st.NIGHT)
+            wall.set_tick_params(pad=2.5)  # dark walls would hide the ends of numbers
         azimuth, elevation = np.degrees(seen(result)) + [_ASIDE, 0.0]
         elevation = min(max(elevation, _LOW), _HIGH)
     if view.ground and not night:
@@ -269,8 +273,8 @@ def _fit_axes(
     ax.set_box_aspect([float(s) for s in view.high - view.low], zoom=zoom)
     # Names stand off their numbers by a share of the box, which is too little where it is thin: by 20 points at least.
     corners = _screen_positions(ax, box_corners(view.low, view.high))
-    for axis, k in ((ax.xaxis, 2), (ax.yaxis, 4)):
-        across = np.linalg.norm([corners[k] - corners[1], corners[k + 1] - corners[0]], axis=1)
+    for axis, i, k in ((ax.xaxis, 2, 1), (ax.yaxis, 4, 1), (ax.zaxis, 4, 2)):
+        across = np.linalg.norm([corners[i] - corners[k], corners[i + k] - corners[0]], axis=1)
         axis.labelpad = max(10.4 * side / float(across.max()) - 14.0, 0.0)
 
 

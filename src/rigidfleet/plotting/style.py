@@ -285,7 +285,7 @@ def note_if_constant(ax: Axes, values: Floats, unit: str) -> bool:
     caption = f"{value:.6g} {unit} throughout" + (f", within {off:.1g}" if off > _ROUNDING else "")
     ax.set_ylim(value - 1.0, value + 1.0)
     ax.set_yticks([value], [f"{value:.6g}"])
-    ax.text(0.5, 0.55, caption, transform=ax.transAxes, ha="center", fontsize=7.5, color=GREY)
+    ax.text(0.5, 0.7, caption, transform=ax.transAxes, ha="center", fontsize=7.5, color=GREY)
     return True
 
 

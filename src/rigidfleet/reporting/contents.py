@@ -64,8 +64,8 @@ def page_contents(
     pages = [_flight_data(*each) for each in zip(flights, judged, names, colours, strict=True)]
     # Trajectories that others made have no gains.
     controlled = any(each["gains"] is not None and each["gains"].rows for each in pages)
-    # The summary has its own page.
-    drawn = [name for name in plotting.figure_names(flights[0]) if name != "summary"]
+    # The summary, or the trajectory where a summary would be empty, has its own page.
+    drawn = plotting.figure_names(flights[0])[1:]
     first: dict[str, Any] = {"brief": [], "sketch": None}
     if not several:
         falls = fall_places_by_sample(flights[0])
@@ -122,7 +122,7 @@ def _flight_data(result: Result, verdict: Verdict, label: str, colour: str) -> d
         "checks": [part for part in verdict.facts().shown_parts if isinstance(part, FactTable)],
         "vehicles": _vehicles_table(result),
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
-        "summary": _figure_for_page(result, "summary"),
+        "summary": _figure_for_page(result, plotting.figure_names(result)[0]),
         "gains": _gains_table(result),
         "digests": brief.provenance_sentences(result),
         "text": result.mission_text,
