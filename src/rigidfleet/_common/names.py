@@ -8,6 +8,10 @@ from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
+import numpy as np
+
+from rigidfleet.typing import Floats
+
 Dimension = str  # time, length, angle or quotients of them
 #: Units by dimension and factor to s, m and rad.
 _UNITS = {
@@ -38,7 +42,8 @@ _WORDS = {
     "none": "std var cov covariance err error sigma noise rate offset min max mean limit size scale omega angular "
             "gyro mag torque force thrust gyr ang euler rpy bias w b",
     "wanted": "ref reference setpoint sp target desired des cmd command goal",
-    "source": "true truth gt groundtruth est estimated meas measured actual raw filtered ekf kf",
+    "source": "true truth gt groundtruth est estimated meas measured actual raw filtered ekf kf gps gnss rtk mocap "
+        "vicon optitrack qualisys vio slam uwb",
     "time": "t time timestamp stamp sec secs second seconds elapsed datetime nsec nsecs nanosec clock",
     "time too": "header sim field ros utc unix epoch date since start relative rel log of posix world in boot",
     "agent": "agent drone vehicle uav uas robot cf crazyflie quad quadrotor quadcopter copter aircraft plane body "
@@ -90,6 +95,14 @@ class ColumnMeaning(NamedTuple):
             return _DIMENSIONS[place[1]]
         special = {"time": "time", "duration": "time", "yaw": "angle", "yaw_rate": "angle/time"}
         return "length" if self.kind in (*DIRECTIONS, "height") else special.get(self.kind, "")
+
+
+def matrix_to_enu(axes: str) -> Floats:
+    """The matrix (3, 3) from places along three directions to east, north, up."""
+    turn = np.zeros((3, 3))
+    for k, letter in enumerate(axes):
+        turn[AXES[letter][0], k] = AXES[letter][1]
+    return turn
 
 
 def unit_of(text: str) -> tuple[Dimension, float] | None:

@@ -36,6 +36,8 @@ _ZIP = b"PK"
 _REFUSED = {
     b"\x89HDF": "is HDF5. Give a result of `rigidfleet run` alone, and any other data as CSV",
     b"#ROSBAG": "is of ROS 1. Convert it: pip install rosbags; rosbags-convert --src {} --dst FOLDER",
+    b"\x1f\x8b": "is compressed. Unpack it: gunzip {}",
+    b"{": "is JSON, and no table. Give a table with a line of names such as time_s,x_m,y_m,z_m",
     poses.ZSTANDARD: "is compressed as a whole. Unpack it: zstd -d {}",
 }
 #: Suffixes of recordings and logs, which may be longer than what is read as a whole, and of all files of trajectories
