@@ -126,8 +126,13 @@ SAME = {
             'time_boot_ms,agent,"x, mm","y, mm","z, mm"',
             "milliseconds,agent,x-mm,y.mm,z{mm}",
             "t_ms,agent,mm_x,mm_y,mm_z",
+            "time.ms,agent,pos.x.mm,pos.y.mm,pos.z.mm",
         )
     },
+    "decimetres": "t,agent,x_dm,y_dm,z_dm\n"
+    + lines(lambda t, i, x, y, z: f"{t},{i},{10 * x},{10 * y},{10 * z}"),
+    "inches": "t,agent,x [in],y [in],z [in]\n"
+    + lines(lambda t, i, *place: ",".join(map(str, (t, i, *(x / 0.0254 for x in place))))),
     "units between axes and vehicles": "t,x1 mm,y1 mm,z1 mm,x_mm_cf2,y_mm_cf2,z_mm_cf2\n"
     + alone(lambda t, i, x, y, z: f"{t},{1e3 * x},{1e3 * y},{1e3 * z},{1e3 * x},4500,2500"),
     "names with numbers": "t,UAV 1 X,UAV 1 Y,UAV 1 Z,UAV 2 X,UAV 2 Y,UAV 2 Z\n"
@@ -173,6 +178,8 @@ SAME = {
     "seconds since 1970": dated(lambda t: f"{1.7e9 + t:.6f}"),
     "dates": dated(lambda t: f"2024-05-01T12:00:{int(t):02d}.{int(t % 1 * 1000):03d}Z"),
     "dates with a blank": dated(lambda t: f"2024-05-01 23:59:{int(t) + 50}.{int(t % 1 * 1e6):06d}"),
+    "dates with their zone among the names": "Time (UTC+2),agent,x (world),y (world),z (world)\n"
+    + dated(lambda t: f"2024-05-01T12:00:0{t:.3f}").split("\n", 1)[1],
     "dates with a zone": dated(
         lambda t: f"2024-05-01T12:00:{int(t):02d}.{int(t % 1 * 1e9):09d}+02:00"
     ),
@@ -299,6 +306,10 @@ NOTED = {
         )
         for word in ("NA", "null", "None", "#N/A", "-nan(ind)", "-nan", "-", "<NA>")
     },
+    "a word that nobody knows": (
+        f"time,agent,x_foo,y_foo,z_foo\n{lines(plain)}",
+        "are read as places of a vehicle 'foo'",
+    ),
     "places by directions, too": (
         HEAD.strip() + ",north,east,down\n" + lines(lambda *v: plain(*v) + ",9,9,9"),
         "north, east, down are not read: x, y and z count",

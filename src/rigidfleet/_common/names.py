@@ -18,7 +18,7 @@ _UNITS = {
     "time": {1.0: "s sec secs second", 1e-3: "ms msec millis millisecond", 1e-6: "us usec microsecond",
              1e-9: "ns nsec nsecs nanosec nanosecond", 60.0: "min", 3600.0: "h hour"},
     "length": {1.0: "m metre meter", 1e-3: "mm millimetre millimeter", 1e-2: "cm centimetre centimeter", 1e3: "km",
-               1e-6: "um micron", 0.3048: "ft feet", 0.9144: "yd yard", 0.0254: "in inch"},
+               0.1: "dm", 1e-6: "um micron", 0.3048: "ft feet", 0.9144: "yd yard", 0.0254: "in inch"},
     "angle": {1.0: "rad radian", math.radians(1.0): "deg degree"},
 }  # fmt: skip
 _UNIT = {
@@ -124,11 +124,11 @@ def meaning_of(name: str) -> ColumnMeaning:
         unit = "deg" if own[3] == "yaw" else ("mm" if own[1] else "m") + "/s" * bool(own[2])
         return ColumnMeaning(own[2] + own[3], unit)
     if bracket := re.fullmatch(r"(.*?)\s*[\[(](.*?)[\])]\s*", name):
-        if bracket[2].strip().lower() in _FRAMES:
+        if bracket[2].strip().lower() in {*_FRAMES} | _IS["time too"] - {"in"} | _IS[""]:
             return _meaning_without_unit(f"{bracket[1]}_{bracket[2]}")
         plain = _meaning_without_unit(bracket[1])
         return plain._replace(unit=bracket[2].strip()) if plain.kind else plain
-    plain, parts = _meaning_without_unit(name), name.split("_")
+    plain, parts = _meaning_without_unit(name), re.split(r"[_.]", name)
     for cut in (2, 1) if not plain.kind or plain.who else ():
         unit, short = "_".join(parts[-cut:]), _meaning_without_unit("_".join(parts[:-cut]))
         if (known := unit_of(unit)) and known[0] == short.dimension:

@@ -218,9 +218,8 @@ def _sweep_and_folder(
     named = what in mission_names()
     others = keys["drill"] is not None and not named and here.suffix != ".toml" and here.exists()
     if of_others and not others:
-        raise RigidfleetError(
-            f"--{next(iter(of_others))}: is of others' trajectories, by --drill; a mission has its own. Remove it."
-        )
+        words = "is of others' trajectories, by --drill; a mission has its own. Remove it."
+        raise RigidfleetError(f"--{next(iter(of_others))}: {words}")
     if others:
         mission = _mission_of_trajectories(here, **of_others)
         read = {key: x for key, x in of_others.items() if key in READING}
@@ -250,10 +249,10 @@ def _mission_of_trajectories(
     if path.suffix == ".nc":
         raise RigidfleetError(f"{path}: is the result of a flight. Drill its mission instead.")
     if separation is None:
-        raise RigidfleetError(
-            f"{path}: is no mission, and has no limits. Give --separation, the least distance [m]."
-        )
+        words = "is no mission, and has no limits. Give --separation, the least distance [m]."
+        raise RigidfleetError(f"{path}: {words}")
     read = read_trajectories(path, spans="stand", **how)
-    return result_of_trajectories(
-        read, separation=separation, radius=radius, name=flight_name(path)
-    ).mission
+    for note in read.notes:
+        console.warn(f"{note}.")
+    own = {"separation": separation, "radius": radius, "name": flight_name(path)}
+    return result_of_trajectories(read, **own).mission

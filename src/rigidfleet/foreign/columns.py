@@ -122,16 +122,16 @@ def _times_and_epoch(table: TextTable, notes: list[str]) -> tuple[Floats, int | 
     number = is_number(fields[0])
     if not table.lines.size or (number and abs(float(fields[0].replace(",", "."))) < _DATES[0]):
         return table.numbers_of_columns(columns)[:, 0], None
-    ticks, _ = [], table.factor(columns[0])
+    ticks, _ = [], number and table.factor(columns[0])
     for line, field in zip(table.lines.tolist(), fields, strict=True):
         if (tick := _parse_number_or_date(field)) is None:
             why = f"the time {table.names[columns[0]]} is {field[:40] or 'empty'}, neither a finite number nor a date"
             raise fault(why, "Write one, such as 2026-05-01T12:00:00.5Z", line)
         ticks.append(tick)
-    unit, source = table.units["time"]
     if not number:
-        table.units["time"], unit = ("dates", "the file"), "s"
-    elif not source:
+        table.units["time"] = "dates", "the file"
+    unit, source = table.units["time"]
+    if not source:
         power = next((k for k in range(4) if _DATES[0] <= ticks[0] / 1000**k < _DATES[1]), 0)
         unit = _TICKS[power]
         table.units["time"] = unit, "its size"
@@ -260,7 +260,8 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
         more = [table.names[k] for kind, k in places if kind in DIRECTIONS and k not in own.place]
         if len(more) > 1:
             notes.append(f"the columns {', '.join(more)} are not read: x, y and z count")
-        if who and meaning_of(table.names[own.place[0]]).who != who.lower():
+        lone = len(flown) == 1 and who[1:].isalpha() and who not in SOURCES | ROLES
+        if who and (lone or meaning_of(table.names[own.place[0]]).who != who.lower()):
             columns = ", ".join(table.names[k] for k in own.place)
             notes.append(f"the columns {columns} are read as places of a vehicle {who!r}")
     return flown
@@ -403,9 +404,8 @@ def _yaw_of_clear_unit(
     whole = far > np.pi and (yaw == np.round(yaw)).all()
     if not table.units["angle"][1] and (whole or far > 2.0001 * np.pi):
         span = f"{yaw.min():g} to {yaw.max():g}"
-        notes.append(
-            f"the yaw is not read: {span} may be degrees or radians. Name it yaw_deg or yaw_rad, or give the unit"
-        )
+        remedy = "Name it yaw_deg or yaw_rad, or give the unit"
+        notes.append(f"the yaw is not read: {span} may be degrees or radians. {remedy}")
         return None
     ordered = (np.diff(time) > 0.0).all()
     if ordered and np.ptp(yaw) > 2.0001 * np.pi and step.max() > 1.0001 * np.pi:

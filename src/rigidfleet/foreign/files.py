@@ -415,6 +415,9 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
         sizes = np.append(moves[moving], np.inf)
         fast = sizes > 0.5 * np.median(sizes)
         odd = (fast[:-2] & fast[1:-1]) | (sizes[1:-1] > 1.5 * sizes[2:])
+        zero = np.abs(curve.pieces[:, :3, 0]).max(axis=1) == 0.0
+        leaps = (moves > _LONGEST * np.median(sizes)) & (zero[:-1] | zero[1:])
+        frozen += [f"{name!r} at {curve.time[k + 1]:g} s" for k in np.flatnonzero(leaps)[:1]]
         for k in np.flatnonzero((np.diff(moving) > _REPEATED) & odd).tolist():
             start, stop = curve.time[[moving[k] + 1, moving[k + 1]]]
             frozen.append(f"{name!r} from {start:g} to {stop:g} s")
@@ -437,7 +440,7 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
     if len(holes) > _LISTED:
         notes.append(f"{len(holes) - _LISTED:,} shorter gaps between samples are bridged, too")
     if frozen:
-        words = f"positions repeat to the last digit between moves, {first_few(frozen)}"
+        words = f"positions repeat to the last digit between moves, or leap from or to 0, {first_few(frozen)}"
         notes.append(f"{words}: a hold, or a tracker that lost sight of it")
     return notes
 

@@ -146,9 +146,8 @@ def _hex_colours(colours: Floats, *, real: bool) -> tuple[str, ...]:
     bad = ~((colours >= 0) & (colours <= 255) & (colours == np.round(colours))).all(axis=1)
     if bad.any():
         k = int(bad.argmax())
-        raise ValueError(
-            f"has colours that are no whole numbers from 0 to 255, first {colours[k].tolist()} of point {k + 1}"
-        )
+        first = f"first {colours[k].tolist()} of point {k + 1}"
+        raise ValueError(f"has colours that are no whole numbers from 0 to 255, {first}")
     return tuple(f"#{row.tobytes().hex()}" for row in colours.astype(np.uint8))
 
 
