@@ -112,6 +112,8 @@ SAME = {
     + lines(lambda t, i, x, y, z: f"{t},{x},{y},{z},cf #{i}"),
     "colours": "color,time,agent,x,y,z\n" + lines(lambda *v: f"#ff000{v[1]}," + plain(*v)),
     "a row of units": HEAD + "ms,-,mm,mm,mm\n" + lines(milli),
+    "a row of units in brackets, blanks": "t agent x y z\n[ms] [-] [mm] [mm] [mm]\n"
+    + lines(lambda *v: milli(*v).replace(",", " ")),
     "a row of units in brackets": HEAD + "[s],,[m],[m],[m]\n" + lines(plain),
     **{
         f"names {head}": f"{head}\n{lines(milli)}"
@@ -958,6 +960,14 @@ def test_units_in_remarks_of_scans_are_noted(tmp_path):
     assert "units: mm' is not read" in " ".join(read_points(tmp_path / "p.ply").notes)
     (tmp_path / "p.ply").write_bytes(data)
     assert not read_points(tmp_path / "p.ply").notes
+
+
+def test_polynomials_that_may_begin_later_are_noted(tmp_path):
+    """Pieces follow each other from 0 s on, whatever a further column says of their times."""
+    due = [f"{a}^{k}" for a in ("x", "y", "z", "yaw") for k in range(8)]
+    (tmp_path / "p.csv").write_text(f"start_time,duration,{','.join(due)}\n5,1{',1' * 32}\n")
+    notes = read_trajectories(tmp_path / "p.csv").notes
+    assert notes == ("the column 'start_time' is not read: pieces join, from 0 s on",)
 
 
 def test_packed_tables_say_how_to_unpack(tmp_path):

@@ -311,7 +311,7 @@ def _find_header(texts: list[str]) -> tuple[int, int, list[str], list[str], str,
     fits = {s: _count_rows_and_width(below, len(names), s) for s in SEPARATORS}
     separator = max(SEPARATORS, key=lambda s: (fits[s][0], s == own))
     width, line = len(names) or fits[separator][1], start + (not names)
-    row = [x.strip("[]()") for x in split_fields(below[0], separator)] if below else []
+    row = split_fields(re.sub(r"[\[\]()]", "", below[0]), separator) if below else []
     units = [""] * width
     if names and len(row) == width and sum(unit_of(x) is not None for x in row) > 1:
         units, start = [x if unit_of(x) else "" for x in row], texts.index(below[0], start) + 1

@@ -40,6 +40,8 @@ def read_text_table(data: bytes, stem: str, interpolation: str, units: Units) ->
             if len(labels) > 1 and not counts:
                 why = f"has polynomials of several vehicles in the column {table.names[k]!r}"
                 raise fault(why, "Give each vehicle a table")
+            if q.kind in ("time", "") and table.names[k]:
+                notes.append(f"the column {table.names[k]!r} is not read: pieces join, from 0 s on")
         curve = _curve_of_coefficients(table)
         record = {"columns": table.names, "rows": len(curve.pieces)}
         return Trajectories((stem,), (curve,), POLYNOMIALS, tuple(notes), (record,))
