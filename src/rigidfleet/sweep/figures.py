@@ -322,9 +322,8 @@ def check_map(numbers: list[str], over: Sequence[str], metric: str) -> None:
     if unknown or len(over) not in (0, 2):
         word, words = unknown[0] if unknown else (" ".join(over), numbers)
         why = " (a seed has no order)" if word.endswith("seed") else ""
-        raise RigidfleetError(
-            f"map: '{word}' cannot be drawn{why}. Choose from: {', '.join(words)}."
-        )
+        remedy = f"Choose from: {', '.join(words)}."
+        raise RigidfleetError(f"map: '{word}' cannot be drawn{why}. {remedy}")
 
 
 def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure | None:

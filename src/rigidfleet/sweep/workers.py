@@ -34,10 +34,8 @@ def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
     """
     flown = sweep_of_json(sweep)
     if version != flown.version:
-        raise RigidfleetError(
-            f"a worker has {flown.version}, but the sweep was started by {version}. Install the same version on all"
-            " machines."
-        )
+        why = f"a worker has {flown.version}, but the sweep was started by {version}"
+        raise RigidfleetError(f"{why}. Install the same version on all machines.")
     return fly_runs(flown, runs)
 
 
@@ -108,9 +106,8 @@ def open_cluster(address: str) -> Generator[tuple[Executor, Callable[[], int]]]:
     try:
         from distributed import Client
     except ImportError:
-        raise RigidfleetError(
-            "--cluster needs the package distributed. Install it: pip install distributed"
-        ) from None
+        why = "--cluster needs the package distributed. Install it: pip install distributed"
+        raise RigidfleetError(why) from None
     try:
         client: Any = Client(address, timeout=_CONNECT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
