@@ -132,10 +132,10 @@ def assess(
         planned = Result.load(files[0]) if files[0].suffix == ".nc" else as_mission(str(files[0]))
     alone = len(files) == 1
     if alone and isinstance(planned, Mission):
-        words = (
-            f"Fly and judge it by `rigidfleet run {files[0]}`, or give logs of its flight behind it"
+        raise RigidfleetError(
+            f"{files[0]}: is a mission, and no flight. Fly and judge it by `rigidfleet run {files[0]}`, or give logs of"
+            " its flight behind it"
         )
-        raise RigidfleetError(f"{files[0]}: is a mission, and no flight. {words}")
     if alone and isinstance(planned, Result):
         if chosen:
             words = f"--{chosen[0].replace('_', '-')}: no effect on a result, which has its own mission; remove it"
@@ -152,8 +152,9 @@ def assess(
         if plan and mission is not None:
             raise RigidfleetError(f"--mission: no effect with the plan {files[0]}; remove one")
         if clock and not plan:
-            words = "needs a plan to compare clocks with; give a mission before the logs"
-            raise RigidfleetError(f"--clock: {words}")
+            raise RigidfleetError(
+                "--clock: needs a plan to compare clocks with; give a mission before the logs"
+            )
         higher = {} if separation_altitude is None else {"separation_altitude": separation_altitude}
         known = planned.mission if isinstance(planned, Result) else planned or mission
         if origin is None and known is not None:

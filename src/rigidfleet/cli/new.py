@@ -102,8 +102,9 @@ def new(
     mission = mission_of_file(text, str(file))
     fails = [r.text for r in preflight(mission, search=False).remarks if r.level == "fails"]
     if fails:
-        why = f"the flight would fail: {'; '.join(fails)}"
-        raise RigidfleetError(f"{file}: not written, because {why}. Change the options.")
+        raise RigidfleetError(
+            f"{file}: not written, because the flight would fail: {'; '.join(fails)}. Change the options."
+        )
     write_file(file, text.encode())
     if json:
         console.print_json({"file": str(file)} | plain_facts(mission))

@@ -169,8 +169,9 @@ def _drill_sentences(folder: Path, mission: Mission) -> list[str]:
     table = store.read(folder)
     outcome, path, own = summarise(table), folder / store.FILE, table.sweep.mission
     if not outcome.drill:
-        words = "has no faults of the day. `rigidfleet sweep --drill` flies them."
-        raise ResultError(f"{path}: {words}")
+        raise ResultError(
+            f"{path}: has no faults of the day. `rigidfleet sweep --drill` flies them."
+        )
     if own.digest != mission.digest:  # a result has the ways that were planned for its mission
         _refuse_other_mission(path, expand_mission(own).digest, mission)
     return [*outcome.drill_sentences(), _name_and_digest_text(path)]
@@ -189,8 +190,9 @@ def _abort_sentences(folder: Path, mission: Mission) -> list[str]:
         data = json.loads(path.read_bytes())
         digest, every = data["mission_sha256"], data["aborts"]
     except (OSError, ValueError, LookupError, TypeError):
-        remedy = f"`rigidfleet check --abort --out {folder}` writes it"
-        raise ResultError(f"{path}: is no file of aborts of this version. {remedy}.") from None
+        raise ResultError(
+            f"{path}: is no file of aborts of this version. `rigidfleet check --abort --out {folder}` writes it."
+        ) from None
     _refuse_other_mission(path, digest, mission)
     ways = [x for x in every if x["way"]]
     to = {"any": "to any places where vehicles stood", "own": "each to its own place"}[data["to"]]

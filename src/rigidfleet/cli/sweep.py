@@ -208,9 +208,10 @@ def _sweep_and_folder(
     here = Path(what)
     if stored := [here] * store.is_store(here) or (shards.shard_folders(here) if shard else []):
         if vary or out is not None or of_others or any(x is not None for x in keys.values()):
-            remedy = "Remove all options that define one: only --runs may grow."
-            why = "is the folder of a sweep, whose definition cannot change"
-            raise RigidfleetError(f"{what}: {why}. {remedy}")
+            raise RigidfleetError(
+                f"{what}: is the folder of a sweep, whose definition cannot change. Remove all options that define one:"
+                " only --runs may grow."
+            )
         definition = store.read(stored[0]).sweep
         definition.runs = definition.runs if runs is None else runs
         return definition, here

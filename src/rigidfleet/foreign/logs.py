@@ -201,8 +201,10 @@ ONE_FRAME = "Name topics of one frame: --topic"
 
 def mixed_frames_in_words(frames: Collection[str]) -> str:
     """That vehicles are in several frames; "" if all are in one."""
-    several = f"positions are in frames {first_few(sorted(frames))}: "
-    return f"{several}where one is in another is not known" if len(frames) > 1 else ""
+    several = (
+        f"positions are in frames {first_few(sorted(frames))}: where one is in another is not known"
+    )
+    return several if len(frames) > 1 else ""
 
 
 def trajectories_of(

@@ -141,8 +141,9 @@ def slots_of_all_distances(n: int, edges: ArrayLike, lengths: ArrayLike) -> Floa
     if error > np.sqrt(REALISABLE) * largest or value[0] < -REALISABLE * n * largest**2:
         # Eigenvalues alone: their vectors, and so the points, are not unique where eigenvalues are equal.
         off = np.sqrt((np.abs(value).sum() - top.sum()) / n)
-        why = f"they miss space by {off:.3g} m in the root mean square"
-        raise ValueError(f"no points in space have these distances ({why})")
+        raise ValueError(
+            f"no points in space have these distances (they miss space by {off:.3g} m in the root mean square)"
+        )
     return _turn_to_slot_convention(p)
 
 

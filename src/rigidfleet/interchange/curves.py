@@ -229,8 +229,9 @@ def motion_and_is_cut(result: Result, *, flown: bool) -> tuple[ExportedMotion, b
     there = np.flatnonzero(known.any(axis=1))
     which = "motion flown" if flown else "reference"
     if not len(there):
-        why = f"the {which} of this flight has no numbers: nothing is tracked"
-        raise ResultError(f"{why}. Export what was flown: --flown.")
+        raise ResultError(
+            f"the {which} of this flight has no numbers: nothing is tracked. Export what was flown: --flown."
+        )
     first, last = int(there[0]), int(there[-1]) + 1
     kept = slice(first, last)
     if not known[kept].all():

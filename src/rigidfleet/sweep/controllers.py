@@ -38,8 +38,9 @@ def import_law_and_digest(name: str) -> tuple[Any, str]:
         controller = law() if isinstance(law, type) else law
         code = Path(there.__file__ or "").read_bytes()
     except (Exception, SystemExit) as error:  # it runs a user's code
-        why = f"{name!r} cannot be imported: {type(error).__name__}: {error}"
-        raise ImportError(why) from error
+        raise ImportError(
+            f"{name!r} cannot be imported: {type(error).__name__}: {error}"
+        ) from error
     if not callable(controller):
         raise ImportError(f"{name!r} is {controller!r}, which cannot be called")
     return law, hashlib.sha256(code).hexdigest()

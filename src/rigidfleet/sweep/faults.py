@@ -222,8 +222,9 @@ class Show:
         self.curve, self.how, verdict, self.names = self._fly_or_read_ways(mission, drill.files)
         if not verdict.passed:
             why = next(check.message for check in verdict.checks if not check.passed)
-            words = f"the flight fails without any fault: {why}. Mend this first."
-            raise RigidfleetError(f"drill: {words}")
+            raise RigidfleetError(
+                f"drill: the flight fails without any fault: {why}. Mend this first."
+            )
         data = judging_mission(self.curve.pieces[0, :, :3, 0], 1.0, mission=mission).to_dict()
         motions = {q.name for q in MOTIONS}  # which a fault leaves as they are
         data["limits"] = {k: x for k, x in data.get("limits", {}).items() if k not in motions}
@@ -264,22 +265,24 @@ class Show:
             )
             self._origin = self._origin or read.read[0].get("origin")
             if len(read.curves) != self.n:
-                why = (
-                    f"has {len(read.curves)} vehicles, and the show {self.n}. Give a file of each."
+                raise RigidfleetError(
+                    f"{files[0]}: has {len(read.curves)} vehicles, and the show {self.n}. Give a file of each."
                 )
-                raise RigidfleetError(f"{files[0]}: {why}")
             strange = sorted({*read.names} - {*self.names})
             if 0 < len(strange) < self.n:  # where some names agree, they say whose a file is
-                why = f"has {first_few(strange)}, and the show has not. Name the vehicles of both alike."
-                raise RigidfleetError(f"{files[0]}: {why}")
+                raise RigidfleetError(
+                    f"{files[0]}: has {first_few(strange)}, and the show has not. Name the vehicles of both alike."
+                )
             if not strange and self.names:
                 order = [read.names.index(name) for name in self.names]
                 read = read._replace(names=self.names, curves=tuple(read.curves[i] for i in order))
             verdict = assess(result_of_trajectories(read, mission=mission))
             return stack_ways(read.curves), read.assumed, verdict, read.names
         if mission.n_agents != self.n:
-            why = f"{mission.name} has {mission.n_agents} agents, and the show {self.n}"
-            raise RigidfleetError(f"drill.stale: {why}. Give an earlier version of the same show.")
+            raise RigidfleetError(
+                f"drill.stale: {mission.name} has {mission.n_agents} agents, and the show {self.n}. Give an earlier"
+                " version of the same show."
+            )
         result = simulate(mission)
         motion = result.setpoints_at_samples(flown=False)
         if not np.isfinite(motion.state).all():  # where no slots are tracked, vehicles have no file

@@ -322,8 +322,9 @@ def check_map(numbers: list[str], over: Sequence[str], metric: str) -> None:
     if unknown or len(over) not in (0, 2):
         word, words = unknown[0] if unknown else (" ".join(over), numbers)
         why = " (a seed has no order)" if word.endswith("seed") else ""
-        remedy = f"Choose from: {', '.join(words)}."
-        raise RigidfleetError(f"map: '{word}' cannot be drawn{why}. {remedy}")
+        raise RigidfleetError(
+            f"map: '{word}' cannot be drawn{why}. Choose from: {', '.join(words)}."
+        )
 
 
 def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure | None:

@@ -34,8 +34,10 @@ def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
     """
     flown = sweep_of_json(sweep)
     if version != flown.version:
-        why = f"a worker has {flown.version}, but the sweep was started by {version}"
-        raise RigidfleetError(f"{why}. Install the same version on all machines.")
+        raise RigidfleetError(
+            f"a worker has {flown.version}, but the sweep was started by {version}. Install the same version on all"
+            " machines."
+        )
     return fly_runs(flown, runs)
 
 
@@ -106,8 +108,9 @@ def open_cluster(address: str) -> Generator[tuple[Executor, Callable[[], int]]]:
     try:
         from distributed import Client
     except ImportError:
-        why = "--cluster needs the package distributed. Install it: pip install distributed"
-        raise RigidfleetError(why) from None
+        raise RigidfleetError(
+            "--cluster needs the package distributed. Install it: pip install distributed"
+        ) from None
     try:
         client: Any = Client(address, timeout=_CONNECT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
