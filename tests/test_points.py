@@ -167,6 +167,14 @@ def test_ten_thousand_points_for_three_agents(folder):
     assert len(told.value.findings) == 1
 
 
+def test_what_is_not_read_of_points_is_noted_before_the_flight(folder, capsys):
+    """A mission whose points may be in another unit says so when it is checked."""
+    (folder / "mm.csv").write_text("# all in mm\nx,y,z\n0,0,1.5\n2.25,0,0\n0,-3,0.125\n")
+    (folder / "m.toml").write_text(PLAIN.replace("logo.ply", "mm.csv"))
+    assert main(["check", str(folder / "m.toml")]) == 0
+    assert "'# all in mm' is not read" in " ".join(capsys.readouterr().out.split())
+
+
 def test_names_need_a_mission_file():
     """A mission from a text has no folder: each name is one finding with a remedy."""
     with pytest.raises(MissionError, match="read only with a mission file") as told:

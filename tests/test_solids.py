@@ -273,6 +273,10 @@ def test_a_bad_obstacle_is_refused_with_a_remedy(obstacle, key, problem, remedy)
     assert remedy in finding.remedy
 
 
+#: A grid as geographers list it: a place and its height in each row.
+PLACES = "".join(f"{x},{y},{x + y}\n" for x in range(4) for y in range(3))
+
+
 @pytest.mark.parametrize("suffix", ["csv", "npy"])
 def test_heights_from_a_file_are_held_by_the_result(tmp_path, suffix):
     """The flight can be repeated from its result after the file is gone."""
@@ -307,10 +311,11 @@ until = 0.5
     with pytest.raises(MissionError, match="no such file"):
         load_mission(tmp_path / "m.toml")
     file = file.with_suffix(".csv")
-    file.write_text("1,2\n3,x\n")
     (tmp_path / "m.toml").write_text(text.replace(".npy", ".csv"))
-    with pytest.raises(MissionError, match="not a table of numbers"):
-        load_mission(tmp_path / "m.toml")
+    for rows, words in (("1,2\n3,x\n", "not a table of numbers"), (PLACES, "list of places x, y")):
+        file.write_text(rows)
+        with pytest.raises(MissionError, match=words):
+            load_mission(tmp_path / "m.toml")
 
 
 # -- flights -------------------------------------------------------------------------------------------

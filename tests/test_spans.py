@@ -276,6 +276,15 @@ def test_positions_that_freeze_are_told(tmp_path):
     assert not said(judged(hover), "repeat to the last digit")
 
 
+def test_leaps_to_the_origin_are_told(tmp_path):
+    """A tracker that writes zeros for what it does not see; a flight through the origin is not doubted."""
+    lost = np.where((EVERY > 3) & (EVERY < 3.25), 0.0, 1.0)
+    for share, doubted in ((lost, True), (1.0, False)):
+        place = lambda t, x=share: np.stack([x * (t - 50), 0 * t, 0 * t], 1)  # noqa: E731
+        path = table(tmp_path / "t.csv", {"A": (EVERY, place)})
+        assert said(judged(path), "or leap from or to 0, 'A' at 3.1 s") == doubted
+
+
 def test_a_jump_after_a_standstill_is_told(tmp_path):
     """Lost while it was slow, and there again far away; one that starts by ever longer steps is not doubted."""
     fast = np.cumsum(np.clip(0.02 * (EVERY - 3), 0.001, 0.2))

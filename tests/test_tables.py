@@ -1,5 +1,6 @@
 """Tables as people write them: what a column means is read, refused with its cause, or noted, by both doors."""
 
+import gzip
 import json
 import struct
 
@@ -111,6 +112,8 @@ SAME = {
     + lines(lambda t, i, x, y, z: f"{t},{x},{y},{z},cf #{i}"),
     "colours": "color,time,agent,x,y,z\n" + lines(lambda *v: f"#ff000{v[1]}," + plain(*v)),
     "a row of units": HEAD + "ms,-,mm,mm,mm\n" + lines(milli),
+    "a row of units in brackets, blanks": "t agent x y z\n[ms] [-] [mm] [mm] [mm]\n"
+    + lines(lambda *v: milli(*v).replace(",", " ")),
     "a row of units in brackets": HEAD + "[s],,[m],[m],[m]\n" + lines(plain),
     **{
         f"names {head}": f"{head}\n{lines(milli)}"
@@ -125,8 +128,13 @@ SAME = {
             'time_boot_ms,agent,"x, mm","y, mm","z, mm"',
             "milliseconds,agent,x-mm,y.mm,z{mm}",
             "t_ms,agent,mm_x,mm_y,mm_z",
+            "time.ms,agent,pos.x.mm,pos.y.mm,pos.z.mm",
         )
     },
+    "decimetres": "t,agent,x_dm,y_dm,z_dm\n"
+    + lines(lambda t, i, x, y, z: f"{t},{i},{10 * x},{10 * y},{10 * z}"),
+    "inches": "t,agent,x [in],y [in],z [in]\n"
+    + lines(lambda t, i, *place: ",".join(map(str, (t, i, *(x / 0.0254 for x in place))))),
     "units between axes and vehicles": "t,x1 mm,y1 mm,z1 mm,x_mm_cf2,y_mm_cf2,z_mm_cf2\n"
     + alone(lambda t, i, x, y, z: f"{t},{1e3 * x},{1e3 * y},{1e3 * z},{1e3 * x},4500,2500"),
     "names with numbers": "t,UAV 1 X,UAV 1 Y,UAV 1 Z,UAV 2 X,UAV 2 Y,UAV 2 Z\n"
@@ -172,11 +180,15 @@ SAME = {
     "seconds since 1970": dated(lambda t: f"{1.7e9 + t:.6f}"),
     "dates": dated(lambda t: f"2024-05-01T12:00:{int(t):02d}.{int(t % 1 * 1000):03d}Z"),
     "dates with a blank": dated(lambda t: f"2024-05-01 23:59:{int(t) + 50}.{int(t % 1 * 1e6):06d}"),
+    "dates with their zone among the names": "Time (UTC+2),agent,x (world),y (world),z (world)\n"
+    + dated(lambda t: f"2024-05-01T12:00:0{t:.3f}").split("\n", 1)[1],
     "dates with a zone": dated(
         lambda t: f"2024-05-01T12:00:{int(t):02d}.{int(t % 1 * 1e9):09d}+02:00"
     ),
     "CR": (HEAD + lines(plain)).replace("\n", "\r"),
     "CRLF": (HEAD + lines(plain)).replace("\n", "\r\n"),
+    "minus signs of print": "time,agent,x,y,z,yaw\n"
+    + lines(lambda *v: f"{plain(*v)},\N{MINUS SIGN}{v[0]}"),
     "a duration": HEAD.strip() + ",duration\n" + lines(lambda *v: plain(*v) + ",0.5"),
     "a column as pandas repeats it": "time,agent,x,y,z,x.1\n"
     + lines(lambda *v: f"{plain(*v)},{v[2]}"),
@@ -275,14 +287,35 @@ NOTED = {
     "units in words": ("# position in millimetres\n" + HEAD + lines(plain), "does it say units"),
     "units below the names": (HEAD + "# all in cm\n" + lines(plain), "does it say units"),
     "units at the end": (HEAD + lines(plain) + "# scale 0.001\n", "does it say units"),
-    "another axis up": ("# Y-up\n" + HEAD + lines(plain), "does it say units or axes"),
+    **{
+        f"beside {line!r}": (f"{line}\n{HEAD}{lines(plain)}", "does it say units or axes")
+        for line in (
+            "# Y-up",
+            "# Up axis: Y",
+            "# frame: NWU",
+            "# x=north y=east z=up",
+            "# left-handed",
+            "# positions in km",
+            "# t [msec]",
+            "# times in frames",
+            "# fps: 25",
+        )
+    },
     **{
         f"no place: {word}": (
             HEAD + lines(plain) + f"2.5,0,{word},{word},{word}\n2.5,1,{word},1,1\n",
             "2 rows without a position are left out",
         )
-        for word in ("NA", "null", "None", "#N/A", "-nan(ind)")
+        for word in ("NA", "null", "None", "#N/A", "-nan(ind)", "-nan", "-", "<NA>")
     },
+    "a word that nobody knows": (
+        f"time,agent,x_foo,y_foo,z_foo\n{lines(plain)}",
+        "are read as places of a vehicle 'foo'",
+    ),
+    "places by directions, too": (
+        HEAD.strip() + ",north,east,down\n" + lines(lambda *v: plain(*v) + ",9,9,9"),
+        "north, east, down are not read: x, y and z count",
+    ),
     "wanted places": (
         HEAD.strip() + ",x_ref,y_ref,z_ref\n" + lines(lambda *v: plain(*v) + ",0,0,0"),
         "x_ref, y_ref, z_ref are not read",
@@ -415,6 +448,38 @@ REFUSED = {
         "t,x,y,z,yaw_deg\n0,0,0,1,0\n1,0,0,1,200\n2,0,0,1,400\n",
         "line 3: the yaw changes by 200 deg, more than half a turn: which way? Give",
     ),
+    "two instruments": (
+        "t,gps_x,gps_y,gps_z,ekf_x,ekf_y,ekf_z\n0,0,0,1,0.1,0,1\n1,1,0,1,1.1,0,1\n",
+        "several places of one vehicle: gps, ekf",
+    ),
+    "thousands by points": (
+        "time_ms;x_mm;y_mm;z_mm\n0;750;0;2.000\n1.000;1.750;0;2.000\n",
+        "x_mm is 1.750, and others have no decimals: are these thousands",
+    ),
+    "a vehicle in the place of another": (
+        "t,x,y,z,x.1,y.1,z.1\n0,0,0,1,0,0,1\n1,1,0,1,1,0,1\n",
+        "x.1, y.1, z.1 may be places of another vehicle",
+    ),
+    "no heights": ("t,name,x,y,z\n0,a,0,0,\n0,b,3,0,\n1,a,1,0,\n1,b,4,0,\n", "has no position"),
+    "polynomials of degree 8": (
+        "duration,"
+        + ",".join(f"{a}^{k}" for a in ("x", "y", "z", "yaw") for k in range(9))
+        + "\n1"
+        + ",1" * 36
+        + "\n",
+        "has the column x^8",
+    ),
+    "polynomials in millimetres": (
+        "duration,"
+        + ",".join(f"{a}^{k}" for a in ("x", "y", "z", "yaw") for k in range(8)).replace(
+            "x^0", "x^0 [mm]"
+        )
+        + "\n1"
+        + ",1" * 32
+        + "\n",
+        "has the column x^0 [mm]",
+    ),
+    "JSON": ('{"t": [0, 1], "x": [0, 1], "y": [0, 0], "z": [1, 1]}\n', "is JSON, and no table"),
     "two nameless columns": (
         "time,pilot,slot,x,y,z\n"
         + lines(lambda t, i, x, y, z: f"{t},{i},{(i + int(2 * t)) % 2},{x},{y},{z}"),
@@ -826,6 +891,7 @@ def test_files_that_claim_more_than_they_have_are_refused(elements, tmp_path):
         ("x_s,y,z\n0,0,0\n1,0,0\n", "no column for x"),
         ("x,y,z,color\n0,0,5,red\n3,0,5,blue\n", "has the colour 'red'"),
         ("time,x,y,z\n0,0,0,5\n1,3,0,5\n", "points of several times"),
+        ("x_mm;y_mm;z_mm\n0;0;5.000\n500;0;5.000\n3.000;0;5.000\n", "are these thousands"),
     ],
 )
 def test_points_that_may_mean_two_things_are_refused(text, cause, tmp_path):
@@ -885,6 +951,30 @@ def test_scans_are_read(data, tmp_path):
     points = read_points(tmp_path / "p.ply")
     np.testing.assert_array_equal(points.slots, CORNER)
     assert points.colours == HUES
+
+
+def test_units_in_remarks_of_scans_are_noted(tmp_path):
+    """A scan in millimetres that says so in a comment is not read as metres in silence."""
+    data = scan("ascii", camera=False)
+    (tmp_path / "p.ply").write_bytes(data.replace(b"obj_info", b"comment units: mm\nobj_info"))
+    assert "units: mm' is not read" in " ".join(read_points(tmp_path / "p.ply").notes)
+    (tmp_path / "p.ply").write_bytes(data)
+    assert not read_points(tmp_path / "p.ply").notes
+
+
+def test_polynomials_that_may_begin_later_are_noted(tmp_path):
+    """Pieces follow each other from 0 s on, whatever a further column says of their times."""
+    due = [f"{a}^{k}" for a in ("x", "y", "z", "yaw") for k in range(8)]
+    (tmp_path / "p.csv").write_text(f"start_time,duration,{','.join(due)}\n5,1{',1' * 32}\n")
+    notes = read_trajectories(tmp_path / "p.csv").notes
+    assert notes == ("the column 'start_time' is not read: pieces join, from 0 s on",)
+
+
+def test_packed_tables_say_how_to_unpack(tmp_path):
+    """A table that gzip packed is refused with what unpacks it."""
+    (tmp_path / "t.csv.gz").write_bytes(gzip.compress((HEAD + lines(plain)).encode()))
+    with pytest.raises(rf.RigidfleetError, match=r"is compressed\. Unpack it: gunzip t\.csv\.gz"):
+        read_trajectories(tmp_path / "t.csv.gz")
 
 
 def test_repeated_points_of_meshes_are_left_out(tmp_path, monkeypatch, capsys):

@@ -8,13 +8,17 @@ from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
+import numpy as np
+
+from rigidfleet.typing import Floats
+
 Dimension = str  # time, length, angle or quotients of them
 #: Units by dimension and factor to s, m and rad.
 _UNITS = {
     "time": {1.0: "s sec secs second", 1e-3: "ms msec millis millisecond", 1e-6: "us usec microsecond",
              1e-9: "ns nsec nsecs nanosec nanosecond", 60.0: "min", 3600.0: "h hour"},
     "length": {1.0: "m metre meter", 1e-3: "mm millimetre millimeter", 1e-2: "cm centimetre centimeter", 1e3: "km",
-               1e-6: "um micron", 0.3048: "ft feet", 0.9144: "yd yard", 0.0254: "in inch"},
+               0.1: "dm", 1e-6: "um micron", 0.3048: "ft feet", 0.9144: "yd yard", 0.0254: "in inch"},
     "angle": {1.0: "rad radian", math.radians(1.0): "deg degree"},
 }  # fmt: skip
 _UNIT = {
@@ -38,7 +42,8 @@ _WORDS = {
     "none": "std var cov covariance err error sigma noise rate offset min max mean limit size scale omega angular "
             "gyro mag torque force thrust gyr ang euler rpy bias w b",
     "wanted": "ref reference setpoint sp target desired des cmd command goal",
-    "source": "true truth gt groundtruth est estimated meas measured actual raw filtered ekf kf",
+    "source": "true truth gt groundtruth est estimated meas measured actual raw filtered ekf kf gps gnss rtk mocap "
+        "vicon optitrack qualisys vio slam uwb",
     "time": "t time timestamp stamp sec secs second seconds elapsed datetime nsec nsecs nanosec clock",
     "time too": "header sim field ros utc unix epoch date since start relative rel log of posix world in boot",
     "agent": "agent drone vehicle uav uas robot cf crazyflie quad quadrotor quadcopter copter aircraft plane body "
@@ -92,6 +97,14 @@ class ColumnMeaning(NamedTuple):
         return "length" if self.kind in (*DIRECTIONS, "height") else special.get(self.kind, "")
 
 
+def matrix_to_enu(axes: str) -> Floats:
+    """The matrix (3, 3) from places along three directions to east, north, up."""
+    turn = np.zeros((3, 3))
+    for k, letter in enumerate(axes):
+        turn[AXES[letter][0], k] = AXES[letter][1]
+    return turn
+
+
 def unit_of(text: str) -> tuple[Dimension, float] | None:
     """Dimension of a unit, and its factor to s, m and rad; None if it is unknown."""
     plain = text.strip().lower().replace("µ", "u").replace("μ", "u").replace("°", "deg")
@@ -111,11 +124,11 @@ def meaning_of(name: str) -> ColumnMeaning:
         unit = "deg" if own[3] == "yaw" else ("mm" if own[1] else "m") + "/s" * bool(own[2])
         return ColumnMeaning(own[2] + own[3], unit)
     if bracket := re.fullmatch(r"(.*?)\s*[\[(](.*?)[\])]\s*", name):
-        if bracket[2].strip().lower() in _FRAMES:
+        if bracket[2].strip().lower() in {*_FRAMES} | _IS["time too"] - {"in"} | _IS[""]:
             return _meaning_without_unit(f"{bracket[1]}_{bracket[2]}")
         plain = _meaning_without_unit(bracket[1])
         return plain._replace(unit=bracket[2].strip()) if plain.kind else plain
-    plain, parts = _meaning_without_unit(name), name.split("_")
+    plain, parts = _meaning_without_unit(name), re.split(r"[_.]", name)
     for cut in (2, 1) if not plain.kind or plain.who else ():
         unit, short = "_".join(parts[-cut:]), _meaning_without_unit("_".join(parts[:-cut]))
         if (known := unit_of(unit)) and known[0] == short.dimension:

@@ -6,7 +6,7 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import islice
 from typing import NamedTuple
 
@@ -24,14 +24,15 @@ _CONTROL = re.compile(r"[^\t\n\r\x20-\x7e\xa0-\U0010ffff]")
 #: What follows a row, and is none of its colours.
 _REMARK = re.compile(r"\s+#(?![0-9a-fA-F]{6}\b).*")
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
-_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}[.,]\d{3}")
+_HUNDREDS = re.compile(r"[-+]?[1-9]\d{0,2}")
 _TEXT = np.dtypes.StringDType()
 #: Words for units and axes in lines that are not read, and for numbers that are not there.
 _UNSAID = re.compile(
-    r"(?i)\b(units?|scale|[mc]m|ft|feet|inch(es)?|ms|us|ns|deg(rees)?|ned|down\w*|[xy][- _]?up"
-    r"|(milli|centi|micro|nano)(met|sec)\w+)\b"
+    r"(?i)\b(units?|scale|[kmc]m|ft|feet|yards?|inch(es)?|[mun]s(ecs?)?|in (frames|minutes)|fps|deg(rees)?|n[ew][ud]"
+    r"|frd|down\w*|north|left[- ]hand\w*|[xy][- _]?up|up[- _]axis|(kilo|milli|centi|micro|nano)(met|sec)\w+)\b"
 )
-_BLANK = {"", "nan", "na", "n/a", "null", "none", "#n/a", "-nan(ind)"}
+_BLANK = re.compile(r"(?i)(-?nan(\(ind\))?|#?n/?a|<na>|nat|null|none|--?|\?)?")
 #: Lines among which names are sought, and by which a separator is chosen; rows read together; characters of a line.
 _HEAD, _SAMPLE, _TOGETHER, _LONGEST = 200, 20, 1 << 14, 100_000
 
@@ -75,7 +76,7 @@ class TextTable:
     texts : all lines of the file
     places : number of the column of each quantity, by kind and vehicle
     units : of each dimension of columns that were read the word, and where it is from: "" if it is assumed
-    unread : a line beside names and rows that speaks of units or axes; "" without one
+    unread : a note on a line beside names and rows that speaks of units or axes, if there is one
 
     Parameters
     ----------
@@ -117,7 +118,7 @@ class TextTable:
         beside = [*self.texts[: max(0, rows[0] - 1)], *self.texts[rows[1] :]]
         if self.named:
             del beside[self.line - 1 : None if any(below) else self.line]
-        self.unread = next((x.strip() for x in beside if _UNSAID.search(x)), "")
+        self.unread = notes_on_units(beside)
 
     def factor(self, k: int) -> float:
         """The factor of the unit of a column, which a row below the names may say.
@@ -195,6 +196,13 @@ class TextTable:
         factors, values = [self.factor(k) for k in which], np.zeros((len(self.lines), len(which)))
         faults = {fault.line: fault for fault in self._faults}
         odd = [i for i, k in enumerate(which) if not _parse_numbers(self.columns[k], values[:, i])]
+        for k in (k for k, factor in zip(which, factors, strict=True) if factor < 1.0):
+            fields = {x for x in self.columns[k].tolist() if not _BLANK.fullmatch(x)}
+            marked = [x for x in fields if "." in x or "," in x]
+            whole = any(map(_HUNDREDS.fullmatch, fields))
+            if marked and whole and all(map(_THOUSANDS.fullmatch, marked)):
+                why = f"{self.names[k]} is {min(marked)}, and others have no decimals: are these thousands?"
+                raise fault(why, "Write no marks between thousands, or decimals everywhere")
         if odd and not self.decimal:
             columns = [self.columns[k].tolist() for k in self.places.values()]
             every = [_REMARK.sub("", x) for column in columns for x in column]
@@ -208,18 +216,24 @@ class TextTable:
                 if is_number(plain) and "," not in plain and math.isfinite(float(plain)):
                     values[row, i] = float(plain)
                     continue
-                if which[i] in blank and field.strip().lower() in _BLANK:
+                if which[i] in blank and _BLANK.fullmatch(field.strip()):
                     values[row, i] = np.nan
                     continue
                 line, name = int(self.lines[row]), self.names[which[i]]
                 why = f"{name} is {field[:40] or 'empty'}, not a finite number"
                 grouped = re.fullmatch(r"[-+]?[\d.,][-+\d.,' eE]*", field)
                 remedy = "Write decimals with a point, and no marks between thousands"
-                remedy = remedy if grouped else "Leave out rows without a position"
+                remedy = remedy if grouped else "Write numbers alone, or leave out the row"
                 faults.setdefault(line, Fault(line, self.texts[line - 1].strip(), why, remedy))
         if faults:
             raise ContentError(*(faults[line] for line in sorted(faults)))
         return values * factors
+
+
+def notes_on_units(lines: Iterable[str]) -> list[str]:
+    """A note on the first of some lines that speaks of units or axes; none without one."""
+    said = (line.strip()[:60] for line in lines if _UNSAID.search(line))
+    return [f"{line!r} is not read: does it say units or axes?" for line in islice(said, 1)]
 
 
 def _parse_numbers(fields: np.ndarray, values: Floats) -> bool:
@@ -235,14 +249,6 @@ def _parse_numbers(fields: np.ndarray, values: Floats) -> bool:
 def are_axes(axes: str) -> bool:
     """Whether three letters are directions of axes."""
     return sorted(AXES.get(letter, (9,))[0] for letter in axes) == [0, 1, 2]
-
-
-def matrix_to_enu(axes: str) -> Floats:
-    """The matrix (3, 3) from places along three directions to east, north, up."""
-    turn = np.zeros((3, 3))
-    for k, letter in enumerate(axes):
-        turn[AXES[letter][0], k] = AXES[letter][1]
-    return turn
 
 
 def is_number(text: str) -> bool:
@@ -280,7 +286,7 @@ def _lines(data: bytes) -> list[str]:
     except UnicodeDecodeError:
         why = "is neither text in UTF-8 nor another known format"
         raise fault(why, "Save a table as UTF-8") from None
-    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\N{MINUS SIGN}", "-")
     if odd := _CONTROL.search(text):
         line = text.count("\n", 0, odd.start()) + 1
         raise fault(f"has the control character U+{ord(odd[0]):04X}", "Save a table as text", line)
@@ -305,7 +311,7 @@ def _find_header(texts: list[str]) -> tuple[int, int, list[str], list[str], str,
     fits = {s: _count_rows_and_width(below, len(names), s) for s in SEPARATORS}
     separator = max(SEPARATORS, key=lambda s: (fits[s][0], s == own))
     width, line = len(names) or fits[separator][1], start + (not names)
-    row = [x.strip("[]()") for x in split_fields(below[0], separator)] if below else []
+    row = split_fields(re.sub(r"[\[\]()]", "", below[0]), separator) if below else []
     units = [""] * width
     if names and len(row) == width and sum(unit_of(x) is not None for x in row) > 1:
         units, start = [x if unit_of(x) else "" for x in row], texts.index(below[0], start) + 1

@@ -250,10 +250,10 @@ def _mission_of_trajectories(
     if path.suffix == ".nc":
         raise RigidfleetError(f"{path}: is the result of a flight. Drill its mission instead.")
     if separation is None:
-        raise RigidfleetError(
-            f"{path}: is no mission, and has no limits. Give --separation, the least distance [m]."
-        )
+        words = "is no mission, and has no limits. Give --separation, the least distance [m]."
+        raise RigidfleetError(f"{path}: {words}")
     read = read_trajectories(path, spans="stand", **how)
-    return result_of_trajectories(
-        read, separation=separation, radius=radius, name=flight_name(path)
-    ).mission
+    for note in read.notes:
+        console.warn(f"{note}.")
+    own = {"separation": separation, "radius": radius, "name": flight_name(path)}
+    return result_of_trajectories(read, **own).mission

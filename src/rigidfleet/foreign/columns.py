@@ -10,16 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import DIRECTIONS, ROLES, SOURCES, meaning_of, unit_of
-from rigidfleet._common.tables import (
-    DEFAULT,
-    SEPARATORS,
-    TextTable,
-    are_axes,
-    fault,
-    is_number,
-    matrix_to_enu,
-)
+from rigidfleet._common.names import DIRECTIONS, ROLES, SOURCES, matrix_to_enu, meaning_of, unit_of
+from rigidfleet._common.tables import DEFAULT, SEPARATORS, TextTable, are_axes, fault, is_number
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.typing import Floats, Ints
 
@@ -84,15 +76,13 @@ def parse_units(units: str | None, axes: str | None) -> Units:
     for word in re.split(r"[,\s]+", units.strip()) if units else ():
         dimension = (unit_of(word) or ("",))[0]
         if dimension not in DEFAULT or dimension in words:
-            raise TrajectoryError(
-                f"units: {word!r}: give one unit each of time, length and angle, such as ms,mm,deg."
-            )
+            remedy = "give one unit each of time, length and angle, such as ms,mm,deg."
+            raise TrajectoryError(f"units: {word!r}: {remedy}")
         words[dimension] = word
     axes = (axes or "").lower()
     if axes and not are_axes(axes):
-        raise TrajectoryError(
-            f"axes: {axes!r}: say where x, y and z point, such as enu (east, north, up) or ned."
-        )
+        remedy = "say where x, y and z point, such as enu (east, north, up) or ned."
+        raise TrajectoryError(f"axes: {axes!r}: {remedy}")
     return Units(words, axes)
 
 
@@ -113,19 +103,14 @@ def parse_table(data: bytes, words: Units) -> tuple[TextTable, list[str]]:
         turned = table.numbers_of_columns(range(4, 8))
         unit = (np.abs(np.linalg.norm(turned, axis=1) - 1.0) < 0.01).all()
         if table.separator not in " \t" or not unit:
-            remedy = "Begin with a line such as time_s,x_m,y_m,z_m"
-            raise fault(
-                "has no names of columns, and no 8 numbers between blanks as TUM's", remedy, 1
-            )
+            why = "has no names of columns, and no 8 numbers between blanks as TUM's"
+            raise fault(why, "Begin with a line such as time_s,x_m,y_m,z_m", 1)
         notes.append(f"8 numbers a line without names are read as TUM's: {' '.join(_TUM)}")
         if (np.linalg.norm(turned[:, :2], axis=1) > np.sqrt(0.5)).any():
             del table.places["qw", ""]
             notes.append("attitudes are upside down, and not read: is their order another one?")
-    if table.unread and words == ({}, ""):
-        doubt = (
-            f"{table.unread[:60]!r} is not read: does it say units or axes? Say --units or --axes"
-        )
-        notes.append(Doubt(doubt))
+    if words == ({}, ""):
+        notes += [Doubt(f"{doubt} Say --units or --axes") for doubt in table.unread]
     return table, notes
 
 
@@ -137,16 +122,16 @@ def _times_and_epoch(table: TextTable, notes: list[str]) -> tuple[Floats, int | 
     number = is_number(fields[0])
     if not table.lines.size or (number and abs(float(fields[0].replace(",", "."))) < _DATES[0]):
         return table.numbers_of_columns(columns)[:, 0], None
-    ticks, _ = [], table.factor(columns[0])
+    ticks, _ = [], number and table.factor(columns[0])
     for line, field in zip(table.lines.tolist(), fields, strict=True):
         if (tick := _parse_number_or_date(field)) is None:
             why = f"the time {table.names[columns[0]]} is {field[:40] or 'empty'}, neither a finite number nor a date"
             raise fault(why, "Write one, such as 2026-05-01T12:00:00.5Z", line)
         ticks.append(tick)
-    unit, source = table.units["time"]
     if not number:
-        table.units["time"], unit = ("dates", "the file"), "s"
-    elif not source:
+        table.units["time"] = "dates", "the file"
+    unit, source = table.units["time"]
+    if not source:
         power = next((k for k in range(4) if _DATES[0] <= ticks[0] / 1000**k < _DATES[1]), 0)
         unit = _TICKS[power]
         table.units["time"] = unit, "its size"
@@ -194,6 +179,8 @@ def read_tracks(
     main = next(iter(sets.values()))
     if len(sets) == 1:
         known, every = np.isfinite([values[k] for k in main.place]).all(axis=0), table.columns
+        if not known.any():
+            raise fault(f"{stem!r} has no position", "Leave it out")
         if not known.all():
             notes.append(f"{np.count_nonzero(~known):,} rows without a position are left out")
             table.lines, table.columns = table.lines[known], [x[known] for x in every]
@@ -201,8 +188,8 @@ def read_tracks(
         place = stack(main.place, slice(None))
         groups, identity = _rows_and_name_columns(table, time, place, columns, stem, notes)
         lost = [x for k in identity for x in {*every[k].tolist()} - {*table.columns[k].tolist()}]
-        if lost or not groups:
-            raise fault(f"{min(lost, default=stem)!r} has no position", "Leave it out")
+        if lost:
+            raise fault(f"{min(lost)!r} has no position", "Leave it out")
     elif any(q.kind == "agent" and len(table.codes(k)[1]) > 1 for k, q in enumerate(table.kinds)):
         why = "has places of several vehicles in a row, and names of vehicles, too"
         raise fault(why, "Keep one of them")
@@ -248,9 +235,8 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
         place, turned = table.position_columns_and_axes(axes, who)
         kinds = ("vx", "vy", "vz"), ("yaw",), ("qx", "qy", "qz", "qw")
         if place:
-            sets[who] = _Places(
-                turned, place, *(table.find_columns(*kind, who=who) for kind in kinds)
-            )
+            parts = (table.find_columns(*kind, who=who) for kind in kinds)
+            sets[who] = _Places(turned, place, *parts)
         if own := {kind: k for (kind, x), k in table.places.items() if x == who and kind in "xyz"}:
             loose[who] = own
     flown = {who: own for who, own in sets.items() if who not in ROLES} or sets
@@ -263,14 +249,19 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
     for who in loose.keys() - flown.keys():
         names = ", ".join(table.names[k] for k in loose[who].values())
         pairs = [(table.places.get((kind, main), -1), k) for kind, k in loose[who].items()]
-        if all((table.columns[i] == table.columns[k]).all() for i, k in pairs):
+        if len(pairs) < 3 and all((table.columns[i] == table.columns[k]).all() for i, k in pairs):
             continue
         if who not in ROLES and (re.search(r"\d", who) or "" not in sets):
             remedy = "Give each vehicle its rows, or columns such as x1, y1, z1, x2, y2, z2"
             raise fault(f"{names} may be places of another vehicle", remedy)
         notes.append(f"the columns {names} are not read: if a vehicle is there, it is not judged")
     for who, own in flown.items():
-        if who and meaning_of(table.names[own.place[0]]).who != who.lower():
+        places = [(kind, k) for (kind, x), k in table.places.items() if x == who]
+        more = [table.names[k] for kind, k in places if kind in DIRECTIONS and k not in own.place]
+        if len(more) > 1:
+            notes.append(f"the columns {', '.join(more)} are not read: x, y and z count")
+        lone = len(flown) == 1 and who[1:].isalpha() and who not in SOURCES | ROLES
+        if who and (lone or meaning_of(table.names[own.place[0]]).who != who.lower()):
             columns = ", ".join(table.names[k] for k in own.place)
             notes.append(f"the columns {columns} are read as places of a vehicle {who!r}")
     return flown
@@ -413,9 +404,8 @@ def _yaw_of_clear_unit(
     whole = far > np.pi and (yaw == np.round(yaw)).all()
     if not table.units["angle"][1] and (whole or far > 2.0001 * np.pi):
         span = f"{yaw.min():g} to {yaw.max():g}"
-        notes.append(
-            f"the yaw is not read: {span} may be degrees or radians. Name it yaw_deg or yaw_rad, or give the unit"
-        )
+        remedy = "Name it yaw_deg or yaw_rad, or give the unit"
+        notes.append(f"the yaw is not read: {span} may be degrees or radians. {remedy}")
         return None
     ordered = (np.diff(time) > 0.0).all()
     if ordered and np.ptp(yaw) > 2.0001 * np.pi and step.max() > 1.0001 * np.pi:

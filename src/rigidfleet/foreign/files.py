@@ -36,6 +36,8 @@ _ZIP = b"PK"
 _REFUSED = {
     b"\x89HDF": "is HDF5. Give a result of `rigidfleet run` alone, and any other data as CSV",
     b"#ROSBAG": "is of ROS 1. Convert it: pip install rosbags; rosbags-convert --src {} --dst FOLDER",
+    b"\x1f\x8b": "is compressed. Unpack it: gunzip {}",
+    b"{": "is JSON, and no table. Give a table with a line of names such as time_s,x_m,y_m,z_m",
     poses.ZSTANDARD: "is compressed as a whole. Unpack it: zstd -d {}",
 }
 #: Suffixes of recordings and logs, which may be longer than what is read as a whole, and of all files of trajectories
@@ -413,6 +415,9 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
         sizes = np.append(moves[moving], np.inf)
         fast = sizes > 0.5 * np.median(sizes)
         odd = (fast[:-2] & fast[1:-1]) | (sizes[1:-1] > 1.5 * sizes[2:])
+        zero = np.abs(curve.pieces[:, :3, 0]).max(axis=1) == 0.0
+        leaps = (moves > _LONGEST * np.median(sizes)) & (zero[:-1] | zero[1:])
+        frozen += [f"{name!r} at {curve.time[k + 1]:g} s" for k in np.flatnonzero(leaps)[:1]]
         for k in np.flatnonzero((np.diff(moving) > _REPEATED) & odd).tolist():
             start, stop = curve.time[[moving[k] + 1, moving[k + 1]]]
             frozen.append(f"{name!r} from {start:g} to {stop:g} s")
@@ -435,7 +440,7 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
     if len(holes) > _LISTED:
         notes.append(f"{len(holes) - _LISTED:,} shorter gaps between samples are bridged, too")
     if frozen:
-        words = f"positions repeat to the last digit between moves, {first_few(frozen)}"
+        words = f"positions repeat to the last digit between moves, or leap from or to 0, {first_few(frozen)}"
         notes.append(f"{words}: a hold, or a tracker that lost sight of it")
     return notes
 

@@ -40,6 +40,8 @@ def read_text_table(data: bytes, stem: str, interpolation: str, units: Units) ->
             if len(labels) > 1 and not counts:
                 why = f"has polynomials of several vehicles in the column {table.names[k]!r}"
                 raise fault(why, "Give each vehicle a table")
+            if q.kind in ("time", "") and table.names[k]:
+                notes.append(f"the column {table.names[k]!r} is not read: pieces join, from 0 s on")
         curve = _curve_of_coefficients(table)
         record = {"columns": table.names, "rows": len(curve.pieces)}
         return Trajectories((stem,), (curve,), POLYNOMIALS, tuple(notes), (record,))
@@ -70,9 +72,11 @@ def _curve_of_coefficients(table: TextTable) -> Piecewise:
         A column is missing, or a duration is not positive.
     """
     due = ["duration", *(f"{axis}^{k}" for axis in NAMES for k in range(POWERS))]
-    if missing := [kind for kind in due if not table.find_columns(kind)]:
+    odd = [f"no column, or two, for {kind}" for kind in due if not table.find_columns(kind)]
+    odd += [f"the column {x}" for x in table.names if "^" in x and x.lower() not in due]
+    if odd:
         remedy = "A table of polynomials has the columns duration, x^0 to x^7, y^0, z^0 and yaw^0 to yaw^7"
-        raise fault(f"has no column, or two, for {missing[0]}", remedy, table.line)
+        raise fault(f"has {odd[0]}", remedy, table.line)
     rows = table.numbers_of_columns(table.find_columns(*due))
     bad = np.flatnonzero(~(rows[:, 0] > 0.0))
     if len(bad):

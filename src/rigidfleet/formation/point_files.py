@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import meaning_of
-from rigidfleet._common.tables import ContentError, Fault, TextTable, fault, matrix_to_enu
+from rigidfleet._common.names import matrix_to_enu, meaning_of
+from rigidfleet._common.tables import ContentError, Fault, TextTable, fault, notes_on_units
 from rigidfleet._common.text import first_few
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.typing import Floats, Ints
@@ -146,9 +146,8 @@ def _hex_colours(colours: Floats, *, real: bool) -> tuple[str, ...]:
     bad = ~((colours >= 0) & (colours <= 255) & (colours == np.round(colours))).all(axis=1)
     if bad.any():
         k = int(bad.argmax())
-        raise ValueError(
-            f"has colours that are no whole numbers from 0 to 255, first {colours[k].tolist()} of point {k + 1}"
-        )
+        first = f"first {colours[k].tolist()} of point {k + 1}"
+        raise ValueError(f"has colours that are no whole numbers from 0 to 255, {first}")
     return tuple(f"#{row.tobytes().hex()}" for row in colours.astype(np.uint8))
 
 
@@ -186,7 +185,7 @@ def _read_point_table(data: bytes) -> tuple[Ints, Floats, Colours, Notes]:
     unread = [repr(name) for k, name in enumerate(table.names) if name and k not in known
               and table.kinds[k].kind not in ("agent", "thing")]  # fmt: skip
     notes += [f"the columns {first_few(unread)} are not read"] * bool(unread)
-    notes += [f"{table.unread[:60]!r} is not read: does it say units or axes?"] * bool(table.unread)
+    notes += table.unread
     if written:
         colours = tuple(f"#{x.lstrip('#').lower()}" for x in table.columns[written[0]].tolist())
         if odd := next((x for x in colours if not re.fullmatch(r"#[0-9a-f]{6}", x)), None):
@@ -260,12 +259,14 @@ def _read_ply(data: bytes) -> tuple[Floats, Colours, Notes]:
         places = [[*columns].index(name) for name in names]
         values = np.array([[float(row[i]) for i in places] for row in cells])
         values = values.reshape(count, len(names))
+    remarks = (" ".join(words) for words in lines if words[:1] in (["comment"], ["obj_info"]))
+    notes = tuple(notes_on_units(remarks))
     if len(names) == 3:
-        return values, None, ()
+        return values, None, notes
     types = {columns[name] for name in names[3:]}
     colours = values[:, 3:] / (65535.0 if types == {"u2"} else 1.0)
     colours = colours if colours.max(initial=0.0) <= 1.0 else np.round(colours)
-    return values[:, :3].copy(), _hex_colours(colours, real=types <= {"u2", "f4", "f8"}), ()
+    return values[:, :3].copy(), _hex_colours(colours, real=types <= {"u2", "f4", "f8"}), notes
 
 
 def _bytes_before_vertices(

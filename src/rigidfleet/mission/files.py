@@ -181,7 +181,7 @@ def _read_points(data: bytes, name: str) -> Content:
     from rigidfleet.formation.point_files import parse_points
 
     points = parse_points(data, name)
-    return Content(points.slots.tolist(), points.colours)
+    return Content(points.slots.tolist(), points.colours, points.notes)
 
 
 def _read_trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Content:
@@ -254,8 +254,12 @@ def _read_heights(data: bytes, name: str) -> Content:
         remedy = "give rows of equal length, separated by commas, or an NPY array"
         raise text_error(name, "is not a table of numbers", remedy) from None
     if heights.ndim != 2 or not heights.size:
-        remedy = "give two or more rows of heights [m]"
-        raise text_error(name, "is not a table of numbers", remedy)
+        raise text_error(name, "is not a table of numbers", "give two or more rows of heights [m]")
+    places = len(heights), len(np.unique(heights[:, :2], axis=0))
+    grid = np.prod([len(np.unique(x)) for x in heights.T[:2]])
+    if heights.shape[1] == 3 and places == (grid, grid) and grid > 3:
+        remedy = "give a row of heights for each x, and origin and spacing in the mission"
+        raise text_error(name, "is a list of places x, y and z", remedy)
     if why := missing_cells_text(heights):
         raise text_error(name, why, FILL)
     if heights.size > bounds.HEIGHTS:
