@@ -56,8 +56,9 @@ def loss_remarks(
     if not np.isfinite(first):
         return
     for remark in _path_remarks(mission, preflight, rest):
-        text = f"{remark.text}. The flight leaves its plan before, at {first:g} s"
-        yield Remark("note", remark.topic, text)
+        if remark.level == "fails":
+            text = f"{remark.text}. The flight leaves its plan before, at {first:g} s"
+            yield Remark("note", remark.topic, text)
     legs = [phase.leg for phase in planned]
     at = next((x for x in legs if x.start < first <= x.end), None)
     ordered = mission.aborts and mission.on_loss == "continue"
