@@ -294,9 +294,9 @@ def test_sweep_page(tmp_path, monkeypatch, capsys):
         exec(compile(code, "sweep.md", "exec"), names)
     assert "\nN " in capsys.readouterr().out
     kinds = re.findall(r"`([\w-]+)\((?:mean|low|a)", text)
-    from rigidfleet.sweep.variation import KINDS
+    from rigidfleet.sweep.variation import VARIATIONS
 
-    assert set(kinds) == set(KINDS)
+    assert set(kinds) == set(VARIATIONS)
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import DIRECTIONS, ROLES, SOURCES, meaning_of, unit_of
+from rigidfleet._common.names import DIRECTIONS, ROLES, SOURCE_WORDS, meaning_of, unit_of
 from rigidfleet._common.tables import (
     DEFAULT,
     SEPARATORS,
@@ -257,7 +257,7 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
     flown = {"": sets[""]} if "" in sets else flown
     if not flown:
         raise table.missing_columns_error(*"xyz")
-    if len(flown) > 1 and flown.keys() <= SOURCES:
+    if len(flown) > 1 and flown.keys() <= SOURCE_WORDS:
         raise fault(f"has several places of one vehicle: {', '.join(flown)}", "Keep one of them")
     main = next(iter(flown))
     for who in loose.keys() - flown.keys():

@@ -9,7 +9,7 @@ from rigidfleet._common.tables import TextTable, fault
 from rigidfleet.foreign.columns import Units, are_row_numbers, parse_table, read_tracks
 from rigidfleet.foreign.curves import (
     ASSUMED,
-    NAMES,
+    CHANNEL_NAMES,
     Trajectories,
     curve_through_samples,
     curve_through_states,
@@ -69,7 +69,7 @@ def _curve_of_coefficients(table: TextTable) -> Piecewise:
     ContentError
         A column is missing, or a duration is not positive.
     """
-    due = ["duration", *(f"{axis}^{k}" for axis in NAMES for k in range(POWERS))]
+    due = ["duration", *(f"{axis}^{k}" for axis in CHANNEL_NAMES for k in range(POWERS))]
     if missing := [kind for kind in due if not table.find_columns(kind)]:
         remedy = "A table of polynomials has the columns duration, x^0 to x^7, y^0, z^0 and yaw^0 to yaw^7"
         raise fault(f"has no column, or two, for {missing[0]}", remedy, table.line)

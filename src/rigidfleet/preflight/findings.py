@@ -43,9 +43,9 @@ _MOST_NAMES = 6
 #: Maximum number of equations for which rigidity, and forces at a step, are computed by a dense decomposition.
 DENSE = 600
 #: Number of agents beyond which tracked slots are those of a show, whose edges are not explained.
-MANY = 12
+_MANY = 12
 #: A limit is exceeded only by more than this rounding error.
-SLACK = 1e-9
+LEEWAY = 1e-9
 
 #: Quantities whose worst planned values are shown without a limit, too.
 WORST_SHOWN = ("separation", "speed", "vertical_speed", "thrust")
@@ -360,7 +360,7 @@ class Preflight(Shown):
     @property
     def is_show(self) -> bool:
         """Whether slots alone concern the user: all phases track them, of many agents, or without edges."""
-        many = self.mission.n_agents > MANY or not len(self.mission.edges)
+        many = self.mission.n_agents > _MANY or not len(self.mission.edges)
         tracked = all(phase.tracks_slots for phase in self.mission.phases)
         return self.mission.n_agents > 1 and many and tracked
 
@@ -544,7 +544,7 @@ def _graph_table(formations: Sequence[FormationCheck]) -> FactTable:
     for f in formations:
         row: dict[str, Any] = {"graph": f.name}
         if f.solve != "dense":
-            row["solved by"] = solvers.WORDS[f.solve]
+            row["solved by"] = solvers.METHOD_WORDS[f.solve]
         if (r := f.rigidity) is not None:
             if r.reachable < r.needed:
                 row["reachable rank"] = r.reachable
