@@ -288,7 +288,9 @@ def test_two_hundred_drawn_missions_follow_the_legs_that_their_checks_plan():
     for mission in missions:
         kinds += compare(mission)
     # Four phases a mission are drawn: the more kinds there are, the rarer is each.
-    assert min(kinds[kind] for kind, model in KINDS.items() if not model.replaced) > 550 / len(KINDS)
+    assert min(kinds[kind] for kind, model in KINDS.items() if not model.replaced) > 550 / len(
+        KINDS
+    )
     written = Counter(p.kind for mission in missions for p in mission.phases)
     assert min(written.values()) > 10
     assert set(written) == set(KINDS)
