@@ -28,6 +28,7 @@ def mission_disturbance(mission: Mission) -> Disturbance:
 
 
 def _draw_disturbance(mission: Mission) -> Disturbance:
+    """All that disturbs a flight of a mission, as tables drawn by its seeds; none if it has no disturbances."""
     d = mission.disturbances
     none = no_disturbance(mission.fleet.mass.copy())
     if d is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
@@ -552,8 +553,9 @@ def _graph_table(formations: Sequence[FormationCheck]) -> FactTable:
                 names = [f"{i}-{j}" for i, j in (r.edges[r.redundant] + 1).tolist()]
                 row["redundant edges"] = Cell(f"{len(names)}", f"({first_few(names, 6)})")
             if r.flexes:
-                who = [agent_names(flex.agents) for flex in r.flexes]
-                row["free motions"] = Cell(f"{len(who)}", f"({first_few(who, 3, '; ')})")
+                ways = Counter(agent_names(flex.agents) for flex in r.flexes)
+                who = [f"{x} in {k} directions" if k > 1 else x for x, k in ways.items()]
+                row["free motions"] = Cell(f"{len(r.flexes)}", f"({first_few(who, 3, '; ')})")
         if (others := f.realisations) is not None:
             row |= {"random starts": others.starts, "this shape": 0}
             for x in others.shapes:

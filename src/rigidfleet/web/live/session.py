@@ -236,6 +236,7 @@ class Session:
             time.sleep(0.02)
 
     def _fly_in_real_time(self) -> None:
+        """Fly tick by tick at the pace of the clock, and tell pages what is new, until stopped or nobody looks."""
         sent: dict[str, Any] = {}
         due = measured = time.monotonic()
         flown = 0
