@@ -83,7 +83,7 @@ CASES: list[tuple[str, str, list[Any], dict[str, Any]]] = [
     ("phases[3].kind", "begins where distances alone have led", [OPEN, TAKE, GO], {}),
     ("phases[1].kind", "needs a formation", [GO], {}),
     ("phases[3].kind", "begins at 1 m/s", [TAKE, GO | {"kind": "fly", "velocity": [1, 0, 0]}, GO], {}),
-    ("phases[2].position", "ways are found round obstacles at rest", [TAKE, GO], {"obstacles": [BALL]}),
+    ("phases[2].position", "ways lead round obstacles at rest", [TAKE, GO], {"obstacles": [BALL]}),
     ("phases[2].position", "its goal leaves agent", [TAKE, GO | {"position": [7, 4, 5]}], {"obstacles": GAP}),
     ("phases[2].position", "no way is found", [TAKE, GO], {"obstacles": GAP}),
 ]  # fmt: skip

@@ -301,9 +301,7 @@ class _Search:
                     f" '{planned.phase}'"
                 )
             if thing.solid.moves and proved < need:
-                problem = (
-                    f"ways are found round obstacles at rest, and on the one found {self._worst}"
-                )
+                problem = f"ways lead round obstacles at rest, and on this one {self._worst}"
                 remedy = "wait before by kind 'hold', or fly elsewhere first"
                 raise self.mistake("position", self.phase.position, problem, remedy)
         return need - least

@@ -527,9 +527,7 @@ def _formation_table(formations: Sequence[FormationCheck]) -> FactTable:
         elif f.solve != "dense" or f.skipped:
             row["rigidity"] = f"{'skipped' if f.skipped else 'too large'}, rigidity not checked"
         else:
-            row["rigidity"] = (
-                "its distances do not determine positions, so its rigidity is not checked"
-            )
+            row["rigidity"] = "not checked, since distances do not determine positions"
     return table_of(rows, ("rigidity", "held by"))
 
 

@@ -85,9 +85,7 @@ def _runs_of_invalid_missions(
     sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats
 ) -> dict[int, tuple[str, str]]:
     """Reason and detail of runs with an invalid mission, by index. Only doubtful missions are checked in full."""
-    bounded = np.all(
-        (np.abs(r) <= bounds.LENGTH.most) & (np.abs(v) <= bounds.SPEED.most), axis=(1, 2)
-    )
+    bounded = np.all((abs(r) <= bounds.LENGTH.most) & (abs(v) <= bounds.SPEED.most), axis=(1, 2))
     r, v = (np.where(bounded[:, None, None], x, 0.0) for x in (r, v))
     apart = [not any(coincident_pairs(points)) for points in r.tolist()]
     refusals = {}

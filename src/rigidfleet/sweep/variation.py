@@ -219,9 +219,7 @@ class Geomspace(_Spaced):
 
 _Kind = Normal | Uniform | LogUniform | Choice | Grid | Linspace | Geomspace
 #: Models of variations by `kind`.
-VARIATIONS: dict[str, type[Variation]] = models_by_kind(
-    Annotated[_Kind, Field(discriminator="kind")]
-)
+VARIATIONS = models_by_kind(Annotated[_Kind, Field(discriminator="kind")])
 #: Keys that stand elsewhere in a line than in the brackets.
 _SHARED = {*Gridded.model_fields, "kind"}
 _LINE = re.compile(r"\s*(.+?)\s*(\+=|\*=|=)\s*([\w-]+)\s*\((.*)\)\s*", re.DOTALL)
