@@ -36,7 +36,7 @@ from rigidfleet.formation import distance_geometry, shapes
 from rigidfleet.formation.graphs import GRAPHS as DESIGNS
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.planning.solvers import WORDS
+from rigidfleet.planning.solvers import METHOD_WORDS
 from rigidfleet.result import Result
 from rigidfleet.rigidity import spectrum
 from rigidfleet.simulation.flight import simulate
@@ -383,7 +383,7 @@ def main() -> int:
     rows = [(measured(k, n), goal) for k, n, goal in flights]
     console.print(table(rows))
     for method in dict.fromkeys(row.solve for row, _ in rows):
-        console.print(f"{method}: {WORDS.get(method, method)}", highlight=False)
+        console.print(f"{method}: {METHOD_WORDS.get(method, method)}", highlight=False)
     exponent, exponents, spent = growth(rows), judging(), show()
     judged = goals(rows, exponent, exponents, spent)
     for goal in judged:

@@ -2,6 +2,21 @@
 
 from typing import Any
 
+#: Keys that a phase of a kind needs, beside one that ends it. Formations are those of a test.
+REQUIRED_KEYS: dict[str, dict[str, Any]] = {
+    "brake": {},
+    "establish": {"formation": "frame"},
+    "fly": {"position": [1.5, 0, 6]},
+    "follow": {"file": "a.csv"},
+    "go": {"position": [1.5, 0, 6]},
+    "hold": {},
+    "land": {},
+    "orbit": {"centre": [4, 0, 6], "radius": 4, "rate_deg_s": 12},
+    "reshape": {"formation": "wide"},
+    "takeoff": {"height": 6},
+    "turn": {"yaw_deg": 9.0},
+}
+
 
 def three_points(establish: dict[str, Any], *phases: dict[str, Any]) -> dict[str, Any]:
     """Three agents that form a triangle about (2, 1, 5) m and then fly these phases, smoothly."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sample_missions import REQUIRED_KEYS
 from scipy.signal import impulse, lsim
 
 from rigidfleet.assessment import assess
@@ -142,18 +143,16 @@ def test_a_brake_takes_its_least_time():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_that_can_be_done_has_a_least_time(kind):
-    """An automatic duration is refused of kinds that are never done, to hold and to orbit, and of no other."""
-    needs = {
-        "establish": TAKE, "reshape": {"formation": "wide"}, "fly": FLY, "go": FLY, "turn": {"yaw_deg": 9.0},
-        "takeoff": {"height": 6}, "follow": {"file": "a.csv"},
-        "orbit": {"centre": [4, 0, 6], "radius": 4, "rate_deg_s": 12},
-    }  # fmt: skip
+    """An automatic duration is refused of kinds that are never done, as to hold and to orbit, and of no other."""
+    done = KINDS[kind].model_construct().has_least_time
+    assert done or kind not in ("brake", "fly", "turn", "land")
+    assert not done or kind not in ("hold", "orbit")
     refused = ""
     try:
-        points(TAKE | BOTH, needs.get(kind, {}) | {"kind": kind} | AUTO)
+        points(TAKE | BOTH, REQUIRED_KEYS[kind] | {"kind": kind} | AUTO)
     except MissionError as error:
         refused = str(error)
-    assert ("has no least duration" in refused) == (kind in ("hold", "orbit"))
+    assert ("has no least duration" in refused) != done
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -653,7 +653,7 @@ def market_square(tmp_path_factory):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("fault", sorted(faults.UNITS.keys() - {"links"}))
+@pytest.mark.parametrize("fault", sorted(faults.FAULTS.keys() - {"links"}))
 def test_the_shipped_drill_has_a_danger_of_each_kind(fault, market_square):
     """Of each fault but lost links, which lights have not, a magnitude is harmless in all trials, another is not."""
     own = [x for x in market_square.values() if x.fault == fault]

@@ -332,7 +332,7 @@ def test_a_ball_is_drawn():
     before = ball.place
     for _ in range(20):
         pilot.fly_tick()
-        assert np.linalg.norm(ball.place - before) <= balls.FASTEST * TICK + 1e-12
+        assert np.linalg.norm(ball.place - before) <= balls.QUICKEST * TICK + 1e-12
         before = ball.place
     assert ball.place[0] > start[0] + 2.0
     pilot.pull_ball(ball.slot, None)

@@ -50,8 +50,8 @@ class Watched:
         pairs = np.array(list(combinations(range(self.n), 2)), dtype=np.int64).reshape(-1, 2)
         none = np.zeros((0, 6))
         every: dict[str, Any] = {
-            "worst": np.full(records.QUANTITIES, np.inf), "when": np.zeros(records.QUANTITIES),
-            "who": np.full((records.QUANTITIES, 2), -1), "sign": np.zeros(1), "left": np.ones(self.n, dtype=np.bool_),
+            "worst": np.full(records.EXTREMA, np.inf), "when": np.zeros(records.EXTREMA),
+            "who": np.full((records.EXTREMA, 2), -1), "sign": np.zeros(1), "left": np.ones(self.n, dtype=np.bool_),
             "standing": np.zeros(self.n, dtype=np.int64), "low": np.full((self.n, 3), np.inf), "pad": 0.0,
             "altitude": math.inf, "pairs": pairs, "columns": pairs, "struck": np.zeros((0, 2), dtype=np.int64),
         } | changes  # fmt: skip
@@ -192,7 +192,7 @@ def test_one_that_hurries_away_from_a_box_is_not_passed_over(axis, side):
 def test_speeds_by_direction_are_not_searched_for_where_they_have_no_limit():
     """Minus infinity as the worst value so far says so."""
     r, v, clock = curves(np.random.default_rng(0), 1, 2)
-    worst = np.full(records.QUANTITIES, np.inf)
+    worst = np.full(records.EXTREMA, np.inf)
     worst[[records.HORIZONTAL_SPEED, records.VERTICAL_SPEED]] = -np.inf
     outcome = Watched(r, v, clock, radius=0.1, worst=worst.copy()).take()
     assert np.array_equal(outcome.monitor.worst == -np.inf, worst == -np.inf)

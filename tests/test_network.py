@@ -338,8 +338,11 @@ def test_what_a_network_cannot_be_is_refused(network, tables, key, words):
     assert finding.remedy
 
 
-def test_a_result_with_links_of_before_loads(tmp_path):
-    """A result whose mission has [disturbances.links] loads with the same numbers in [network]; a file is refused."""
+def test_links_of_before_are_a_network(tmp_path):
+    """[disturbances.links] gives the numbers of [network]: with one warning in a mission, and with none in a result.
+
+    Beside [network] it is refused, as are its keys there.
+    """
     m = mission({"delay": 0.02, "loss": 0.3, "seed": 5}, time=5.0)
     result = rf.simulate(m)
     data = m.to_dict()
@@ -350,8 +353,18 @@ def test_a_result_with_links_of_before_loads(tmp_path):
     file = tmp_path / "earlier.nc"
     result.save(file)
     assert rf.Result.load(file).mission.network == m.network
+    text = tmp_path / "earlier.toml"
+    text.write_text(to_toml(data))
+    for load in (lambda: rf.load_mission(text), lambda: rf.Mission.from_dict(data)):
+        with pytest.warns(
+            FutureWarning, match=r"\[disturbances.links\] is now \[network\]"
+        ) as warned:
+            now = load()
+        assert len(warned) == 1
+        assert now.to_dict() == m.to_dict() | {"disturbances": {}}
+        assert rf.Mission.from_toml(now.text).network == now.network == m.network
     with pytest.raises(MissionError, match=r"it is now called '\[network\]'"):
-        rf.Mission.from_dict(data)
+        rf.Mission.from_dict(data | {"network": {}})
     data["network"] = data["disturbances"].pop("links")
     with pytest.raises(MissionError, match=r"network.dropped = 0.3: .*\n *it is now called 'loss'"):
         rf.Mission.from_dict(data)

@@ -210,7 +210,7 @@ def test_a_result_keeps_what_was_promised(tmp_path):
 
 
 def test_kinds_without_a_promise_are_named():
-    """Each of the eleven kinds is in the table of promises of the documents."""
+    """Each kind of phase is in the table of promises of the documents."""
     with open("docs/missions.md", encoding="utf-8") as page:
         text = page.read().split("**What a phase promises.**")[1].split("\n\n**")[0]
     assert all(f"`{kind}`" in text for kind in KINDS)

@@ -46,7 +46,7 @@ def derivative(vehicle: fleet.VehicleDynamics, S, command, wind) -> np.ndarray:
 
 def by_rotors(flight: fleet.SampledFlight) -> fleet.SampledFlight:
     """The same flight under rotor commands, which can be overwritten."""
-    return flight._replace(commands=flight.commands._replace(kind=fleet.ROTORS))
+    return flight._replace(commands=flight.commands._replace(kind=fleet.ROTOR_SPEEDS))
 
 
 def relative(ours, theirs) -> float:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from rigidfleet.errors import MissionError
-from rigidfleet.mission import check, findings, rules
+from rigidfleet.mission import KINDS, check, findings, rules
 
 
 class Case(NamedTuple):
@@ -26,9 +26,12 @@ def many_knots() -> list[Any]:
     return [[[1.0 + k * 1e-5, *[0.0] * 4]] * 70 for k in range(400)]
 
 
+RULES = (
+    Path(__file__).with_name("rules.toml").read_text("utf-8").replace("{KINDS}", ", ".join(KINDS))
+)
 CASES = [
     Case(**rule | {"mission": tomllib.loads(rule["mission"])})
-    for rule in tomllib.loads(Path(__file__).with_name("rules.toml").read_text("utf-8"))["rule"]
+    for rule in tomllib.loads(RULES)["rule"]
 ]
 # Those that only large missions break.
 CASES += [

@@ -257,7 +257,7 @@ def test_a_law_at_a_slower_rate_holds_its_force():
     forces = call.f_u.reshape(10, 5, -1)
     assert (forces == forces[:, :1]).all()
     assert (forces[1:, 0] != forces[:-1, 0]).any(axis=1).all()
-    assert given[3].count[fleet.LAWS] == 10
+    assert given[3].count[fleet.LAW_TICKS] == 10
 
 
 # -- options ---------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from scipy.interpolate import BSpline
 from scipy.spatial.distance import pdist
 
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.planning.certificate import CLOSE, prove_ways
+from rigidfleet.planning.certificate import PROOF_SLACK, prove_ways
 from rigidfleet.planning.transfers import Transfer, least_duration, plan_transfer
 
 BOX = ((-1.5, -1.5, 0.2), (1.5, 1.5, 2.2))
@@ -76,11 +76,13 @@ def test_a_certificate_of_bent_ways_is_a_tight_lower_bound():
             for j in range(i):
                 least = min(least, float(np.linalg.norm(x[:, i] - x[:, j], axis=1).min()))
     assert proof.separation <= least - 0.2
-    assert proof.separation >= least - 0.2 - CLOSE - 1e-6
+    assert proof.separation >= least - 0.2 - PROOF_SLACK - 1e-6
     k = np.searchsorted(knots, proof.time, side="right") - 1
     x = ways[k] @ (proof.time - knots[k]) ** np.arange(6)
     i, j = proof.agents
-    np.testing.assert_allclose(np.linalg.norm(x[i] - x[j]) - 0.2, proof.separation, atol=2 * CLOSE)
+    np.testing.assert_allclose(
+        np.linalg.norm(x[i] - x[j]) - 0.2, proof.separation, atol=2 * PROOF_SLACK
+    )
 
 
 def test_vehicles_that_keep_their_distance_need_no_search():
@@ -93,7 +95,7 @@ def test_vehicles_that_keep_their_distance_need_no_search():
         [np.stack([-np.sin(time + a), np.cos(time + a), 0 * time], 1) for a in (0.0, np.pi)], 1
     )
     proof = prove_ways(*Piecewise.hermite(time, np.stack([x, v, -x, -v])))
-    assert 2.0 - 2 * CLOSE <= proof.separation <= 2.0
+    assert 2.0 - 2 * PROOF_SLACK <= proof.separation <= 2.0
 
 
 def test_the_slowest_vehicle_alone():

@@ -77,6 +77,59 @@ def test_one_class_a_name():
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
 
 
+#: Modules whose constants are always read with the module's name, by which they mean something else.
+READ_BY_MODULE = ("mission/bounds.py",)
+#: Constants with two meanings, and why.
+TWO_MEANINGS = {
+    "FORMATS": "of figures in rigidfleet.plotting, of files in rigidfleet.interchange: both are documented"
+}
+
+
+def constants(tree):
+    """Public constants of a module and the text of their values; '' for places in an array, which are numbered."""
+    for node in tree.body:
+        if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
+            continue
+        value = ast.unparse(node.value)
+        numbered = re.fullmatch(r"range\(.+\)|\([\d, ]+\)", value)
+        for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+            for part in ast.walk(target):
+                if isinstance(part, ast.Name) and re.fullmatch(r"[A-Z][A-Z0-9_]+", part.id):
+                    several = isinstance(target, ast.Tuple)
+                    yield part.id, "" if several and numbered else value
+
+
+def test_one_meaning_a_constant():
+    """A public constant that two modules have under one name has one value.
+
+    Places in arrays of the kernel have the names of what stands there, which several arrays hold, each elsewhere.
+    Letters are those of the paper.
+    """
+    values = defaultdict(set)
+    for path, tree in TREES.items():
+        if path.relative_to("rigidfleet").as_posix() not in READ_BY_MODULE:
+            for name, value in constants(tree):
+                values[name].add(value)
+    assert len(values) > 300
+    assert {name for name, some in values.items() if len(some) > 1} == TWO_MEANINGS.keys()
+
+
+def test_some_constants_are_read_with_their_module():
+    """No module imports a constant of `READ_BY_MODULE` by its name alone."""
+    modules = {
+        f"rigidfleet.{path.removesuffix('.py').replace('/', '.')}" for path in READ_BY_MODULE
+    }
+    alone = [
+        f"{path}:{node.lineno} {name.name}"
+        for path, tree in TREES.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module in modules
+        for name in node.names
+        if name.name.isupper()
+    ]
+    assert alone == []
+
+
 def test_nothing_has_a_name_of_the_dialect():
     """Nothing is called found, told, given, asked or led: no constant, argument or attribute, however private."""
     names = [

@@ -21,7 +21,7 @@ HEADER = (
 #: Ratio of the time before a sample to that after it, from which on it counts as clearly longer.
 _LONGER = 2.0
 #: Greatest number of setpoints [one agent at one time] of a table: a file of 3 GB.
-MOST = 20_000_000
+MOST_SETPOINTS = 20_000_000
 
 
 class Setpoints(NamedTuple):
@@ -66,7 +66,7 @@ def setpoints_at_rate(samples: Setpoints, rate: float | None) -> Setpoints:
     Raises
     ------
     ValueError
-        The rate is not positive, or gives more than `MOST` setpoints, or a single one of a flight that lasts.
+        The rate is not positive, or gives more than `MOST_SETPOINTS` setpoints, or a single one of a flight that lasts.
     """
     time = samples.time
     later = np.append(np.nextafter(time[:-1], np.inf) < time[1:], True)
@@ -81,8 +81,8 @@ def setpoints_at_rate(samples: Setpoints, rate: float | None) -> Setpoints:
         raise ValueError(
             f"a rate of {rate:g} Hz gives one setpoint in {span:.4g} s; use {1.0 / span:.3g} Hz or more"
         )
-    if count * n > MOST:
-        fits = (MOST / n - 1) / span
+    if count * n > MOST_SETPOINTS:
+        fits = (MOST_SETPOINTS / n - 1) / span
         raise ValueError(
             f"a rate of {rate:g} Hz gives {count * n:,} setpoints; use {fits:.3g} Hz or less"
         )

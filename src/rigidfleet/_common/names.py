@@ -63,7 +63,7 @@ CRAZYFLIE = re.compile(r"stateEstimate(Z?)\.(v?)([xyz]|yaw)")
 #: Words for places that are wanted.
 WANTED = _IS["wanted"]
 #: Words by which places of one vehicle differ, where several have no other name.
-SOURCES = _IS["source"]
+SOURCE_WORDS = _IS["source"]
 #: Words for places that are wanted, or for no places, beside those of a vehicle.
 ROLES = _IS["none"] - {"w", "b"} | WANTED
 #: A letter alone, and what a quantity is nothing without: an acceleration without a velocity, ...

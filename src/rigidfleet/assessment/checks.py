@@ -17,7 +17,7 @@ from rigidfleet.assessment.fits import is_rigid
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import (
     FLIPPED,
-    SLACK,
+    LEEWAY,
     TOUCH_DOWN,
     CheckResult,
     Extreme,
@@ -421,7 +421,7 @@ def _boundary_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
         limit, (agent, place) = q.limit_of(measured.mission), e.who.split(", ", 1)
         words = boundary_in_words(q.name, agent, place, e.value, e.when)
         words += f" (limit {limit:g} m)" if q.key else ""
-        passed = limit is None or q.rank(e.value) <= q.rank(limit) + SLACK
+        passed = limit is None or q.rank(e.value) <= q.rank(limit) + LEEWAY
         yield limit_check(q, e, limit, words, passed=passed)
 
 
@@ -464,7 +464,7 @@ def _rotor_force_check(measured: Measurements, q: Quantity) -> Iterator[CheckRes
         f"the {LABELS['rotor'][j]} rotor of {e.who} gives up to {value(worst, 'N')} at {when:.2f} s"
         f" (limit {value(limit, 'N')})"
     )
-    yield limit_check(q, e, limit, words, passed=share <= 1.0 + SLACK)
+    yield limit_check(q, e, limit, words, passed=share <= 1.0 + LEEWAY)
 
 
 def _saturation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:

@@ -24,7 +24,7 @@ from rigidfleet._common.text import all_hold_in_words
 from rigidfleet._common.waypoints import SHAPE_TOLERANCE, WAYPOINT_TOLERANCE
 
 #: Share of a limit, or of a unit if this is more, by which rounding may exceed it.
-SLACK = 1e-9
+LEEWAY = 1e-9
 #: Greatest speed downwards at touch-down [m/s]: the default of ArduPilot's LAND_SPEED.
 TOUCH_DOWN = 0.5
 #: Angle beyond which a plane's normal, or a line's direction, counts as flipped [deg].
@@ -188,8 +188,8 @@ class PhaseVerdict:
 def keeps_limit(q: Quantity, worst: float, limit: float) -> bool:
     """Whether a worst value keeps its limit."""
     if q.at_least:
-        return worst >= limit - SLACK and worst > 0
-    return worst <= limit + SLACK * max(1.0, abs(limit))
+        return worst >= limit - LEEWAY and worst > 0
+    return worst <= limit + LEEWAY * max(1.0, abs(limit))
 
 
 def limit_check(

@@ -10,7 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import DIRECTIONS, ROLES, SOURCES, matrix_to_enu, meaning_of, unit_of
+from rigidfleet._common.names import (
+    DIRECTIONS,
+    ROLES,
+    SOURCE_WORDS,
+    matrix_to_enu,
+    meaning_of,
+    unit_of,
+)
 from rigidfleet._common.tables import DEFAULT, SEPARATORS, TextTable, are_axes, fault, is_number
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.typing import Floats, Ints
@@ -243,7 +250,7 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
     flown = {"": sets[""]} if "" in sets else flown
     if not flown:
         raise table.missing_columns_error(*"xyz")
-    if len(flown) > 1 and flown.keys() <= SOURCES:
+    if len(flown) > 1 and flown.keys() <= SOURCE_WORDS:
         raise fault(f"has several places of one vehicle: {', '.join(flown)}", "Keep one of them")
     main = next(iter(flown))
     for who in loose.keys() - flown.keys():
@@ -260,7 +267,7 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
         more = [table.names[k] for kind, k in places if kind in DIRECTIONS and k not in own.place]
         if len(more) > 1:
             notes.append(f"the columns {', '.join(more)} are not read: x, y and z count")
-        lone = len(flown) == 1 and who[1:].isalpha() and who not in SOURCES | ROLES
+        lone = len(flown) == 1 and who[1:].isalpha() and who not in SOURCE_WORDS | ROLES
         if who and (lone or meaning_of(table.names[own.place[0]]).who != who.lower()):
             columns = ", ".join(table.names[k] for k in own.place)
             notes.append(f"the columns {columns} are read as places of a vehicle {who!r}")

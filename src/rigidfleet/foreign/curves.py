@@ -16,8 +16,8 @@ from rigidfleet.math.piecewise import Piecewise, pad
 from rigidfleet.typing import Floats, Ints
 
 #: Names of the channels of a curve.
-NAMES = ("x", "y", "z", "yaw")
-CHANNELS = len(NAMES)
+CHANNEL_NAMES = ("x", "y", "z", "yaw")
+CHANNELS = len(CHANNEL_NAMES)
 
 #: What is assumed between samples, in words.
 ASSUMED = {

@@ -490,6 +490,7 @@ def _number_of(message: Any, field: str, index: str = "") -> float:
 
 
 def _read_bin(path: Path) -> Log:
+    """Read a log of ArduPilot's: messages as channels, those of the main estimator first, and when it was armed."""
     from pymavlink.DFReader import DFReader_binary
 
     class Reader(DFReader_binary):
@@ -522,6 +523,10 @@ def _read_bin(path: Path) -> Log:
 
 
 def _read_tlog(path: Path) -> Log:
+    """Read messages of MAVLink as a ground station stores them: channels of each system, and when it was armed.
+
+    The time of a single autopilot's arming is known; of several systems it is not looked for.
+    """
     from pymavlink.mavutil import mavlogfile
 
     with closing(mavlogfile(str(path))) as log:

@@ -62,6 +62,13 @@ def read_show(data: bytes) -> Trajectories:
 
 
 def _read_drones(archive: _Archive) -> Trajectories:
+    """Name and curve of each drone of a show; drones that share a trajectory share its curve.
+
+    Raises
+    ------
+    ContentError
+        Something is missing or has another type, or all curves together are too large.
+    """
     show = _read_json(archive, "show.json")
     drones = _value_at(show, "swarm.drones", list, "show.json")
     if not drones:
@@ -142,6 +149,13 @@ def _dereference(archive: _Archive, value: Any, where: str) -> dict[str, Any]:
 
 
 def _curve_of_drone(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who: str) -> Piecewise:
+    """The curve of one drone, (K, 4, P) [m, rad] over the show's time [s]: Bezier segments as powers, nan for no yaw.
+
+    Raises
+    ------
+    ContentError
+        A point is no point, times do not increase, or a segment has too many control points.
+    """
     points = _value_at(trajectory, "points", list, who)
     if not points:
         raise fault(f"{who}: its trajectory has no points")

@@ -9,7 +9,7 @@ from rigidfleet._common.tables import TextTable, fault
 from rigidfleet.foreign.columns import Units, are_row_numbers, parse_table, read_tracks
 from rigidfleet.foreign.curves import (
     ASSUMED,
-    NAMES,
+    CHANNEL_NAMES,
     Trajectories,
     curve_through_samples,
     curve_through_states,
@@ -71,7 +71,7 @@ def _curve_of_coefficients(table: TextTable) -> Piecewise:
     ContentError
         A column is missing, or a duration is not positive.
     """
-    due = ["duration", *(f"{axis}^{k}" for axis in NAMES for k in range(POWERS))]
+    due = ["duration", *(f"{axis}^{k}" for axis in CHANNEL_NAMES for k in range(POWERS))]
     odd = [f"no column, or two, for {kind}" for kind in due if not table.find_columns(kind)]
     odd += [f"the column {x}" for x in table.names if "^" in x and x.lower() not in due]
     if odd:

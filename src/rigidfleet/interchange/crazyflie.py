@@ -14,7 +14,7 @@ from functools import wraps
 import numpy as np
 
 from rigidfleet.errors import ResultError
-from rigidfleet.foreign.curves import NAMES, curve_to_rows, rows_to_curve
+from rigidfleet.foreign.curves import CHANNEL_NAMES, curve_to_rows, rows_to_curve
 from rigidfleet.interchange.curves import YAW_TOLERANCE, ExportedMotion, fit_curves
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.splines import POWERS
@@ -27,7 +27,7 @@ _MM, _TENTH, _MS = 1e-3, np.radians(0.1), 1e-3
 _MOST, _LONGEST = 32_767, 65_535
 #: What rounding to millimetres can move a position, and more [m].
 COMPRESSED_ROUNDING = 1e-3
-_HEADER = ",".join(["duration", *(f"{name}^{k}" for name in NAMES for k in range(POWERS))])
+_HEADER = ",".join(["duration", *(f"{name}^{k}" for name in CHANNEL_NAMES for k in range(POWERS))])
 #: Numbers of coefficients that a compressed piece can store beyond the first, by kind; its head: kinds and duration.
 _STORED = (0, 1, 3, 7)
 _PIECE = struct.Struct("<BH")
@@ -64,7 +64,7 @@ def _refuse_beyond_memory(
 
 def write_polynomial(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """A table for each vehicle: duration [s], and 8 coefficients of x, y, z [m] and yaw [rad] of each piece."""
-    row = ",".join(["%.9g"] * (1 + len(NAMES) * POWERS))
+    row = ",".join(["%.9g"] * (1 + len(CHANNEL_NAMES) * POWERS))
     for curve in fit_curves(motion.curve_chunks(), tolerance):
         lines = [row % tuple(numbers) for numbers in curve_to_rows(curve)]
         yield "\n".join([_HEADER, *lines, ""]).encode()

@@ -25,7 +25,7 @@ from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result.lights import light_fades
 
 #: Greatest number of vehicles of a show.
-MOST = 5000
+_MOST = 5000
 #: Direction of the mission's x axis, east, from north [deg].
 _EAST = 90.0
 #: A constant date of the archive's entries, the earliest that zip has: the same show gives the same bytes.
@@ -38,10 +38,10 @@ def write_skyc(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     Raises
     ------
     ResultError
-        There are more than `MOST` vehicles.
+        There are more than `_MOST` vehicles.
     """
-    if motion.n_agents > MOST:
-        raise ResultError(f"a show has at most {MOST} drones, and this flight {motion.n_agents}.")
+    if motion.n_agents > _MOST:
+        raise ResultError(f"a show has at most {_MOST} drones, and this flight {motion.n_agents}.")
     mission = motion.result.mission
     changes = light_fades(motion.result)
     drones, files = [], {}

@@ -8,7 +8,7 @@ the body axes b1, b2, b3; the rates omega [rad/s] and accelerations [rad/s^2] in
 import math
 
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
-from rigidfleet.kernel.fleet import ATTITUDE, ROTORS, speed_of
+from rigidfleet.kernel.fleet import ATTITUDE, ROTOR_SPEEDS, speed_of
 from rigidfleet.kernel.linalg import copy_vector
 from rigidfleet.kernel.rigid_body import attitude_matrix
 
@@ -192,7 +192,7 @@ def command_rotors(k, i, flight, state):
             command[q] = share * F[q]
         return share < 1.0
     least, most = vehicles.speed[i, 0], vehicles.speed[i, 1]
-    if commands.kind == ROTORS:
+    if commands.kind == ROTOR_SPEEDS:
         saturated = False
         for j in range(4):
             command[j] = min(max(commands.speeds[i, j], least), most)

@@ -33,7 +33,7 @@ _BARRIERS = 32
 #: Distance that counts as none [m].
 _NEAREST = 1e-6
 #: Greatest number of rows of an exact solution of the barriers.
-EXACT = 64
+MOST_ROWS = 64
 
 
 class Sight(NamedTuple):
@@ -150,9 +150,9 @@ class AvoidanceArrays(NamedTuple):
     pushing: Ints  # (W,) work: rows that push
     hold: Floats  # (N,) share to which edges of a vehicle hold
     pull: Floats  # (m,) what barriers add to the multipliers of edges [N]
-    system: Floats  # (EXACT, EXACT) work
-    right: Floats  # (EXACT,)
-    active: Ints  # (EXACT,)
+    system: Floats  # (MOST_ROWS, MOST_ROWS) work
+    right: Floats  # (MOST_ROWS,)
+    active: Ints  # (MOST_ROWS,)
     # The record
     count: Ints  # (3,) see `TICKS`
     acted: Ints  # (3, N) ticks at which each acted on a vehicle, see `BARRIER`
@@ -218,7 +218,7 @@ def avoidance_arrays(
         behind=np.zeros(n), far=np.zeros(n), threat=np.full(n, -1),
         late=np.zeros(n), shifted=np.zeros((4, 3)), trial=np.zeros((5, 3)), normal=np.zeros(3),
         hold=np.ones(n), pull=np.zeros(edges),
-        system=np.zeros((EXACT, EXACT)), right=np.zeros(EXACT), active=np.zeros(EXACT, dtype=np.int64),
+        system=np.zeros((MOST_ROWS, MOST_ROWS)), right=np.zeros(MOST_ROWS), active=np.zeros(MOST_ROWS, dtype=np.int64),
         count=np.zeros(3, dtype=np.int64), **_barrier_arrays(n, count), **_empty_avoidance_record(n),
     )  # fmt: skip
 

@@ -25,7 +25,7 @@ makes the problem solvable where barriers contradict each other. Edges let go wh
 import math
 
 from rigidfleet.kernel.attitude_control import limit_tilt_in_place
-from rigidfleet.kernel.avoidance import BARRIER, EXACT, KNOWN
+from rigidfleet.kernel.avoidance import BARRIER, KNOWN, MOST_ROWS
 from rigidfleet.kernel.avoidance import needed_gap_acceleration as _needed_rate
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.constraint import find_multipliers
@@ -296,7 +296,7 @@ def solve_active_set(count, p, w, avoid):
     size, m = 0, p.graph.edges.shape[0]
     for k in range(count):
         if 0.0 < avoid.push[k] < avoid.most[k]:
-            if size + m >= EXACT:
+            if size + m >= MOST_ROWS:
                 return False
             avoid.active[size] = k
             size += 1

@@ -2,7 +2,7 @@
 
 A polynomial in Bernstein form lies in the convex hull of its coefficients (control points), so the least coefficient
 bounds it from below. If the bound of a piece is no better than the least value so far, the piece is done. Otherwise it
-is halved by de Casteljau's algorithm, until the bound of each piece is within `CLOSE` of an attained value. Squared
+is halved by de Casteljau's algorithm, until the bound of each piece is within `ACCURACY` of an attained value. Squared
 distances of two agents are polynomials of eighth degree. The distance to a box is convex and nowhere below its tangent
 plane, so the least coefficient along the plane's normal bounds it.
 """
@@ -16,7 +16,7 @@ from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.solids.distance import box_distance, box_normal
 
 #: Accuracy of a least value [m, m/s].
-CLOSE = 1e-9
+ACCURACY = 1e-9
 #: Length of the shortest piece of a step.
 _SHORTEST = 2.0**-32
 #: Maximum number of pieces examined per step.
@@ -34,7 +34,7 @@ _SQUARE = np.array(
 def least_polynomial_value(work, degree, to_beat):
     """Least value of a polynomial over [0, 1] and its place, if below ``to_beat``; otherwise ``to_beat`` and -1.
 
-    ``work[0]`` holds the Bernstein coefficients. The value is exact to `CLOSE` and rounding; for squares, of eighth
+    ``work[0]`` holds the Bernstein coefficients. The value is exact to `ACCURACY` and rounding; for squares, of eighth
     degree, its root is. After `_MOST` pieces, more than any known flight needs, the bound itself is returned, which
     errs on the safe side.
     """
@@ -55,9 +55,9 @@ def least_polynomial_value(work, degree, to_beat):
         elif value < best:
             best, at = value, piece[start]
         # Of a square s, an error e of its root is an error 2 e sqrt(s) + e^2 of s.
-        close = CLOSE
+        close = ACCURACY
         if degree == 8:
-            close = CLOSE * (2.0 * math.sqrt(min(abs(best), size)) + CLOSE)
+            close = ACCURACY * (2.0 * math.sqrt(min(abs(best), size)) + ACCURACY)
         close = max(close, _ROUNDING * size)
         if bound < best - close and pieces > _MOST:
             best, at = bound, piece[start]
@@ -184,7 +184,7 @@ def least_norm_of_curve(to_beat, work, pieces):
             length = norm_at(piece, place)
             if length < best:
                 best, at = length, piece[15] + place * piece[16]
-        close = max(CLOSE, _ROUNDING * math.sqrt(size))  # the accuracy that rounding allows
+        close = max(ACCURACY, _ROUNDING * math.sqrt(size))  # the accuracy that rounding allows
         known = _ROUNDING * size <= close * max(2.0 * best, 1e-5)
         if count > _MOST and not known and along < best * math.sqrt(middle):
             best, at = along / math.sqrt(middle), piece[15]
@@ -236,7 +236,7 @@ def halve_or_prune_piece(bound, best, at, close, count, top, pieces):
 @jit
 def start_piece_stack(pieces):
     """Start a stack with the curve ``pieces[0]`` (15 control points); returns the accuracy that its rounding allows."""
-    close = CLOSE
+    close = ACCURACY
     for k in range(15):
         close = max(close, _ROUNDING * abs(pieces[0, k]))
     pieces[0, 15], pieces[0, 16] = 0.0, 1.0

@@ -23,12 +23,12 @@ from rigidfleet.typing import Bools, Floats, Ints
 STATES = 17
 #: What commands the vehicles (`Commands.kind`): the desired forces of the formation law; thrust and attitude; rotors;
 #: forces by laws of their own, which the flight asks for.
-FORCE, ATTITUDE, ROTORS, OWN = range(4)
+FORCE, ATTITUDE, ROTOR_SPEEDS, OWN = range(4)
 #: Places in `SampledState.clock`: the time, and that of the last evaluation of the law [s].
 TIME, LAW_TIME = range(2)
 #: Places in `SampledState.count`: steps of the grid that are complete, attitude ticks done, law ticks done, samples
 #: written, steps in the trail, ticks up to which own laws have answered.
-STEPS, TICKS, LAWS, SAMPLES, TRAILED, ANSWERED = range(6)
+STEPS, TICKS, LAW_TICKS, SAMPLES, TRAILED, ANSWERED = range(6)
 #: Columns of `SampledState.worst`: least cosine of the tilt; greatest tracking error [m], acceleration [m/s^2], thrust
 #: [N], constraint force [N], horizontal and vertical acceleration [m/s^2].
 UPRIGHT, ERROR, ACCELERATION, LOAD, CONSTRAINT_FORCE, HORIZONTAL, VERTICAL = range(7)
@@ -455,7 +455,7 @@ def state_under_problem(
     With ``integral`` (m,) of its constraints [m s] and its frame, a quaternion (4,). The old state shares arrays with
     the new one and must not be used further.
     """
-    state.clock[LAW_TIME], state.count[LAWS] = state.clock[TIME], 0
+    state.clock[LAW_TIME], state.count[LAW_TICKS] = state.clock[TIME], 0
     n = len(state.S)
     return state._replace(
         integral=np.array(integral, dtype=float), frame=_frame_at_rest(frame),

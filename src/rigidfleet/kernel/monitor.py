@@ -20,7 +20,7 @@ do not depend on where the trail is cut, because the order of evaluations does n
 import math
 
 from rigidfleet.kernel.bernstein import (
-    CLOSE,
+    ACCURACY,
     ball_radius,
     distance_to_box,
     gap_and_normal,
@@ -280,7 +280,7 @@ def surely_apart(i, j, n_axes, reach, monitor):
     If so, their curves need not be compared. False does not say that they come closer.
     """
     balls = monitor.balls
-    far, reach = 0.0, reach + balls[i, 3] + balls[j, 3] + CLOSE
+    far, reach = 0.0, reach + balls[i, 3] + balls[j, 3] + ACCURACY
     for q in range(n_axes):
         x = balls[i, q] - balls[j, q]
         far += x * x
@@ -323,7 +323,7 @@ def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
     work, bound = monitor.work, math.inf
     for k in range(5):
         bound = min(bound, sign * curve[k, axis] - offset)
-    if bound < monitor.worst[kind] - CLOSE:
+    if bound < monitor.worst[kind] - ACCURACY:
         for k in range(5):
             work[0, k] = sign * curve[k, axis] - offset
         value, at = least_polynomial_value(work, 4, monitor.worst[kind])

@@ -6,7 +6,7 @@ handles those. Otherwise it handles all, by the distance of `rigidfleet.solids.d
 In the axes of an obstacle that moves straight, the path of an agent over a step is a polynomial of fourth degree; steps
 are cut at waypoints. The signed distance to a convex solid is convex along the path, and nowhere below its tangent
 plane. A height map is not convex, but each of its triangles is: outside, its distance is the least of theirs, and exact
-to `bernstein.CLOSE` as well. Inside, its depth is that at five points of each step, and its sign is certain.
+to `bernstein.ACCURACY` as well. Inside, its depth is that at five points of each step, and its sign is certain.
 """
 
 import math

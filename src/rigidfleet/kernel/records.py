@@ -35,7 +35,7 @@ LEAST_ERROR = math.log(1e-4)
     SPEED, THRUST, THRUST_MARGIN, ACCELERATION, CONSTRAINT_FORCE, TENSION, CONSTRAINT, HORIZONTAL_SPEED, VERTICAL_SPEED,
     HORIZONTAL_ACCELERATION, VERTICAL_ACCELERATION,
 ) = range(21)  # fmt: skip
-QUANTITIES = VERTICAL_ACCELERATION + 1
+EXTREMA = VERTICAL_ACCELERATION + 1
 #: Place in `Monitor.count`: 1 if the first step of the trail has been searched, and stays as a neighbour of the next.
 STAYED = 0
 #: Triple product of three unit vectors below which a pivot counts as lost.
@@ -146,8 +146,8 @@ def new_monitor(
         pieces=np.zeros((40, 17)), basis=np.zeros((5, 5)), attitudes=np.zeros((5, 3, 3)),
         centres=np.zeros((5, 6)), knots=np.zeros((5, 3)), scratch=np.zeros((3, 10)),
         **watched or {
-            "worst": np.full(QUANTITIES, np.inf), "when": np.zeros(QUANTITIES), "sign": np.zeros(1),
-            "who": np.full((QUANTITIES, 2), -1), "left": np.ones(n, dtype=np.bool_),
+            "worst": np.full(EXTREMA, np.inf), "when": np.zeros(EXTREMA), "sign": np.zeros(1),
+            "who": np.full((EXTREMA, 2), -1), "left": np.ones(n, dtype=np.bool_),
             "standing": np.zeros(n, dtype=np.int64), "low": np.full((n, 3), np.inf), "pad": 0.0, "altitude": np.inf,
             "pairs": none, "struck": none, "columns": none,
         },

@@ -28,8 +28,8 @@ from rigidfleet.kernel.fleet import (
     ERROR,
     FORCE,
     HORIZONTAL,
+    LAW_TICKS,
     LAW_TIME,
-    LAWS,
     LOAD,
     OWN,
     SAMPLES,
@@ -331,7 +331,7 @@ def find_desired_forces(k, t, p, w, flight, state, call):
         copy_vector(state.frame[1], state.frame[2])
         quaternion_rate(state.frame[0], w.cm[4], state.frame[1])
     state.clock[LAW_TIME] = t
-    state.count[LAWS] += 1
+    state.count[LAW_TICKS] += 1
     finite = abs(state.force.sum()) < math.inf
     if finite and call.guard != 0:
         return call_recorder(call.guard, flight, state, call.avoidance, 0) != 0
@@ -344,8 +344,8 @@ def advance_frame(t, p, state):
 
     The frame turns with the true motion. The method of Adams and Bashforth is of second order.
     """
-    if p.has_frame and state.count[LAWS] > 0:
-        dt, first = t - state.clock[LAW_TIME], state.count[LAWS] == 1
+    if p.has_frame and state.count[LAW_TICKS] > 0:
+        dt, first = t - state.clock[LAW_TIME], state.count[LAW_TICKS] == 1
         for q in range(4):
             before = state.frame[1, q] if first else state.frame[2, q]
             state.frame[0, q] += dt * (1.5 * state.frame[1, q] - 0.5 * before)

@@ -25,7 +25,7 @@ from rigidfleet.solids.records import swept_extent
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: How far a worst value may be from the worst of the curve: of a fence, and of a fall [m].
-CLOSE, CLOSE_FALL = 1e-3, 1e-2
+_NEAR, _NEAR_FALL = 1e-3, 1e-2
 #: Heights between floor and ceiling of people at which falls are looked at. Between two of them, the way that is flown
 #: sideways counts in full: a distance is at most an eighth of that less than it is.
 _LEVELS = 5
@@ -86,10 +86,10 @@ class Boundaries:
         self.wind = np.array(mission.all_disturbances.wind)
         kind_of = [fence.kind for fence in mission.fences]
         self.every = [
-            _Boundary("people", k, partial(self._nearness_of_falls, region), CLOSE_FALL)
+            _Boundary("people", k, partial(self._nearness_of_falls, region), _NEAR_FALL)
             for k, region in areas_judged_by(mission, "people")
         ] + [
-            _Boundary(name, k, partial(_distance_outside, region, kind_of[k] == "inclusion"), CLOSE)
+            _Boundary(name, k, partial(_distance_outside, region, kind_of[k] == "inclusion"), _NEAR)
             for name in ("fence", "soft_fence")
             for k, region in areas_judged_by(mission, name)
         ]

@@ -357,7 +357,7 @@ def _each_obstacle_rules(m: Draft) -> Breaches:
     things = []
     for k, data in enumerate(m.tables("obstacles")):
         path = ("obstacles", k)
-        if (kind := m.model_class_of_kind(data, path, obstacles.KINDS)) is None:
+        if (kind := m.model_class_of_kind(data, path, obstacles.OBSTACLE_KINDS)) is None:
             continue
         name = "ground" if kind is obstacles.Ground else f"{data['kind']} {k + 1}"
         if (thing := m.validate(kind, data, path, {"name": name})) is not None:

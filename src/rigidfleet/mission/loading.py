@@ -8,6 +8,7 @@ from typing import Any
 from rigidfleet.errors import wrong_type
 from rigidfleet.mission.files import inline_files
 from rigidfleet.mission.model import Mission
+from rigidfleet.mission.network import with_network
 from rigidfleet.mission.schema import Start
 from rigidfleet.mission.text import mission_names, mission_text, parse_toml, read_text
 
@@ -42,18 +43,14 @@ def mission_of_file(text: str, origin: str) -> Mission:
 def recorded_mission(text: str, origin: str) -> Mission:
     """The mission of a text that a result keeps; an earlier version may have written it.
 
-    Links of [disturbances.links] are those of [network]: each vehicle heard all others, not only its neighbours.
+    What it calls otherwise is taken without a warning, since nobody is going to change it.
 
     Raises
     ------
     MissionError
         With a finding for each error.
     """
-    data = parse_toml(text, origin)
-    links = data.get("disturbances", {}).pop("links", None)
-    if links is not None and "network" not in data:
-        data["network"] = {{"dropped": "loss"}.get(key, key): value for key, value in links.items()}
-    return Mission.from_plain(data, origin, text=text)
+    return Mission.from_plain(with_network(parse_toml(text, origin)), origin, text=text)
 
 
 def as_mission(mission: Mission | str | Path) -> Mission:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from copy import copy
 from functools import cached_property, lru_cache, wraps
@@ -28,6 +29,7 @@ from rigidfleet.mission.changes import add_scaled_formations, split_shared_forma
 from rigidfleet.mission.check import check_parts, default_tables
 from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.kinds import Establish, Phase
+from rigidfleet.mission.network import with_network
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
 from rigidfleet.mission.phases import latest_end_of_phases
 from rigidfleet.mission.schema import DRAG, Aborting, Contents, Disturbances
@@ -133,11 +135,20 @@ class Mission(Contents, Shown):
     def from_plain(cls, data: dict[str, Any], origin: str, *, text: str = "") -> Self:
         """Check a mission given as the plain data of its TOML text, as `to_dict` returns it; the mission keeps them.
 
+        An earlier name of a table works, with a warning; the mission's own text then is one with the name of now.
+
         Raises
         ------
         MissionError
             With a finding for each error.
         """
+        if (current := with_network(data)) is not data:
+            words = (
+                "[disturbances.links] is now [network], where a vehicle hears its neighbours alone"
+            )
+            # Who has written a file is warned, too, by the command: Python shows no DeprecationWarning of modules.
+            warnings.warn(f"{origin}: {words}", FutureWarning, stacklevel=3)
+            data, text = current, ""
         parts = check_parts(data, origin)
         if parts["assignment"] == "each":
             parts["formations"], parts["phases"] = split_shared_formations(

@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from rigidfleet._common.renamed import RENAMED
 from rigidfleet.mission.losses import agent_number_rules, loss_time_rules
 from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.schema import Network
 from rigidfleet.mission.vehicles import NOT_SAMPLED
+
+
+def with_network(data: dict[str, Any]) -> dict[str, Any]:
+    """Plain data of a mission with [network] in the place of [disturbances.links]; the same data if it has none.
+
+    Vehicles with the earlier table heard all others, not only their neighbours.
+    """
+    match data:
+        case {"disturbances": {"links": dict(links), **others}} if "network" not in data:
+            network = {RENAMED.get(key, key): value for key, value in links.items()}
+            return data | {"disturbances": others, "network": network}
+    return data
 
 
 def network_rules(m: Draft) -> Breaches:

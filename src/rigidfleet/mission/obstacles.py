@@ -231,7 +231,7 @@ class Ground(Part):
 
 
 Obstacle = Annotated[Box | Ground | Sphere | Cylinder | Hull | Heights, Field(discriminator="kind")]
-KINDS: dict[str, type[Part]] = models_by_kind(Obstacle)
+OBSTACLE_KINDS: dict[str, type[Part]] = models_by_kind(Obstacle)
 
 
 def is_ground(thing: Obstacle) -> bool:

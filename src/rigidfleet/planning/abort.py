@@ -34,7 +34,7 @@ from rigidfleet.mission.kinds import Follow, Land
 from rigidfleet.mission.obstacles import Sphere, is_ground
 from rigidfleet.planning.avoidance import kept_distances, why_no_landing
 from rigidfleet.planning.certificate import (
-    CLOSE,
+    PROOF_SLACK,
     Certificate,
     certificate_of,
     prove_straight_ways,
@@ -51,7 +51,7 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 #: Greatest acceleration [m/s^2], jerk [m/s^3] and speed [m/s] of a vehicle on its way home, unless `limits` asks for
 #: less.
-BRAKING, JERK, SPEED = 2.0, 5.0, 5.0
+BRAKING, JERK, _SPEED = 2.0, 5.0, 5.0
 #: Greatest vertical speed of a vehicle with rotors [m/s], which descends in its own inflow.
 _SINKING = 2.5
 #: Height of the last straight way down [m], and the greatest speed [m/s] there.
@@ -214,7 +214,7 @@ class Aborts:
         rotors = not all(model.point for model in mission.vehicle_models or ())
         sinking = _SINKING if rotors else math.inf
         self.home_limits = capped_limits(
-            mission, acceleration=BRAKING, jerk=JERK, speed=SPEED, vertical_speed=sinking
+            mission, acceleration=BRAKING, jerk=JERK, speed=_SPEED, vertical_speed=sinking
         )
         self.no_landing = why_no_landing(mission)
         self.need, widest = kept_distances(mission)[0], 2.0 * float(self.radius.max())
@@ -325,8 +325,8 @@ class Aborts:
             if proved is None and len(self.left) > 1:  # no slots are tracked there
                 proved = self._prove_ways(make(), self.left)
             least = min(least, proved or least)
-        # Its polynomials differ from the plan's ways by less than `CLOSE`.
-        return self._step(name, make, least._replace(time=0.0), CLOSE, path=end)
+        # Its polynomials differ from the plan's ways by less than `PROOF_SLACK`.
+        return self._step(name, make, least._replace(time=0.0), PROOF_SLACK, path=end)
 
     def _step(
         self, name: str, make: Callable[[], Piecewise], least: Certificate, off: float, **how: Any
@@ -413,7 +413,7 @@ class Aborts:
 
         lands = name == "down"
         longest = float(np.linalg.norm(end - start, axis=1).max())
-        time, _ = shortest_time(_FASTEST * longest / (DESCENT if lands else SPEED), limit_ratios)
+        time, _ = shortest_time(_FASTEST * longest / (DESCENT if lands else _SPEED), limit_ratios)
         least = prove_straight_ways(start, end, time, self.radius, self.lost) or _APART_FOR_EVER
         return self._step(name, partial(_rest_to_rest, start, end, time), least, 0.0, lands=lands)
 

@@ -15,11 +15,11 @@ from rigidfleet.planning.derivatives import reference_of_agents
 from rigidfleet.typing import Bools, Floats
 
 #: What a certificate of bent ways gives away, so that its search ends [m].
-CLOSE = 1e-6
+PROOF_SLACK = 1e-6
 #: Shares of a blend's duration, and of the paths flown by then.
 _TAU = np.linspace(0.0, 1.0, 2001)
 _FLOWN = septic_polynomial(_TAU)
-#: Where a certificate is from: a closed form is exact; conservative advancement gives away `CLOSE`.
+#: Where a certificate is from: a closed form is exact; conservative advancement gives away `PROOF_SLACK`.
 How = Literal["closed form", "conservative advancement"]
 
 
@@ -98,8 +98,8 @@ def prove_ways(
 
     Let p(t) = sum_k c_k (t - m)^k be the way of one vehicle relative to another about the middle m of a span of length
     2 h, and n the direction of c_0. Then |p(t)| >= n . p(t) >= |c_0| - sum_k |n . c_k| h^k. Spans in which this bound
-    is less than the least distance known, `CLOSE` set aside, are halved until there are none (conservative advancement,
-    of second order where the distance is stationary).
+    is less than the least distance known, `PROOF_SLACK` set aside, are halved until there are none (conservative
+    advancement, of second order where the distance is stationary).
     """
     n, powers = ways.shape[1], ways.shape[3]
     r = np.zeros(n) if radius is None else radius
@@ -119,9 +119,9 @@ def prove_ways(
             k = int(separation.argmin())
             if separation[k] < best[0]:
                 best = float(separation[k]), float(middle[k]), (i, int(other[k]))
-            open_ = separation - fall < best[0] - CLOSE
+            open_ = separation - fall < best[0] - PROOF_SLACK
             c, half, middle, other = c[open_], half[open_] / 2, middle[open_], other[open_]
             c = np.concatenate([expand_about(c, -half), expand_about(c, half)])
             middle = np.concatenate([middle - half, middle + half])
             half, other = np.tile(half, 2), np.tile(other, 2)
-    return Certificate(best[0] - CLOSE, best[1], best[2], "conservative advancement")
+    return Certificate(best[0] - PROOF_SLACK, best[1], best[2], "conservative advancement")

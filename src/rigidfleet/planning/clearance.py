@@ -22,7 +22,7 @@ from rigidfleet.solids.records import Solids
 from rigidfleet.typing import Floats, Ints
 
 #: Accuracy of a planned clearance [m].
-CLOSE = 1e-3
+CLEARANCE_ACCURACY = 1e-3
 #: Greatest number of times that the time between two samples is halved, and of positions: in one step, and in all.
 _HALVINGS, _AT_ONCE, _IN_ALL = 16, 200_000, 4_000_000
 #: Greatest rate of the septic blend, 140 x^3 (1 - x)^3 at x = 1/2.
@@ -83,7 +83,7 @@ class Closest(NamedTuple):
     clearance: float  # [m]
     agent: int
     time: float  # [s]
-    proved: float  # what the clearance is never below [m]: to `CLOSE` as a rule, less if that took too long
+    proved: float  # never less clearance [m]: to `CLEARANCE_ACCURACY` as a rule, less if that took too long
 
 
 class _Spans(NamedTuple):
@@ -128,7 +128,7 @@ def clearance_to(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: 
         if solid.moves:
             way = way + shift_bound(solid, spans.first, spans.first + spans.length)[:, None]
         low = 0.5 * (spans.near + spans.far - way)
-        open_ = low < best - CLOSE
+        open_ = low < best - CLEARANCE_ACCURACY
         if not open_.any():
             continue
         if spans.halved == _HALVINGS or done > _IN_ALL:
@@ -156,7 +156,7 @@ def clearance_to(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: 
                 np.concatenate([between, spans.far]), np.tile(spans.speed, (2, 1)), who, spans.halved + 1,
             )
         )  # fmt: skip
-    return Closest(best, agent, when, min(least, best - CLOSE))
+    return Closest(best, agent, when, min(least, best - CLEARANCE_ACCURACY))
 
 
 def _path_and_speeds(

@@ -45,7 +45,7 @@ from rigidfleet.typing import Floats
 _REST_WITHIN = 10.0
 #: Height above the ground at which a landing ends [m]: the vehicles' lags and noise shall not lead them into it; and
 #: the speed downwards there [m/s]. Both are well within what the verdict takes as standing on the ground.
-ABOVE, TOUCH_DOWN = 0.05, 0.2
+ABOVE, LANDING_SPEED = 0.05, 0.2
 #: How far the first point of given ways may be off [m, m/s, rad], and the time in which the difference fades [s].
 _START_TOLERANCES, _FADED = (0.1, 0.1, math.radians(5.0)), 1.0
 #: Ways of vehicles straight up or down that differ by less count as one [m].
@@ -161,7 +161,7 @@ def _vertical_course(mission: Mission, phase: Vertical, now: PhaseState, t_end: 
             lift = Lift(np.outer(rise - up[2], before.T[:, 2]), travel)
     else:
         up[2] = -max(0.0, height_above_landing(mission, now))
-        v[2] = -min(TOUCH_DOWN, -up[2] / (arrival - now.t))
+        v[2] = -min(LANDING_SPEED, -up[2] / (arrival - now.t))
     goal = copy_with(before, r=before.r + up, v=v, omega=np.zeros(3))
     return Course(goal, arrival, partial(smooth_motion, pose, goal, now.t, arrival), lift)
 

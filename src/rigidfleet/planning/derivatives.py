@@ -23,7 +23,7 @@ ORDERS = 5
 #: Coefficients (8,) of the blend s(x), ascending.
 _BLEND = septic_polynomial(Polynomial([0.0, 1.0])).coef
 #: Speed from which yaw "along" follows the way, and length over which it turns into the way (`yaw_derivatives`).
-SLOW, TRAIL = 0.5, 1.0
+SLOW, _TRAIL = 0.5, 1.0
 #: Share of the turn towards one side, by which a vehicle that starts backwards turns round.
 _SIDE = 0.5
 #: Rotation vector that is taken as zero [rad]: at ten metres it moves a slot by no more than positions are rounded.
@@ -162,7 +162,7 @@ def yaw_derivatives(
     unless the body both rolls and pitches, and is undefined only upside down. "towards": the direction to a point,
     undefined straight above it. "along": the heading h follows the horizontal velocity v of the slot by
 
-        yaw' = (v x a) / (|v|^2 + SLOW^2) + (h x v + _SIDE (|v| - h . v)) / TRAIL.
+        yaw' = (v x a) / (|v|^2 + SLOW^2) + (h x v + _SIDE (|v| - h . v)) / _TRAIL.
 
     The first term is the rate at which the way turns. The second one turns the vehicle into its way, as the trail of a
     castor does; its last part decides to which side a vehicle turns that starts backwards. All terms are smooth, and
@@ -255,14 +255,14 @@ def _yaw_ode_terms(taylor: Floats) -> tuple[Floats, Floats]:
     speed_dot, root_dot = va / np.where(speed > 0.0, speed, 1.0), va / root
     turned = (v[0] * a[1] - v[1] * a[0]) / size
     turned_dot = (v[0] * j[1] - v[1] * j[0] - 2.0 * va * turned) / size
-    astern, back = _SIDE / TRAIL * vv / root, _SIDE / TRAIL * speed / root
-    astern_dot = (_SIDE / TRAIL * 2.0 * va - astern * root_dot) / root
-    back_dot = (_SIDE / TRAIL * speed_dot - back * root_dot) / root
-    terms = turned + astern, v[1] / TRAIL - back * v[0], -v[0] / TRAIL - back * v[1]
+    astern, back = _SIDE / _TRAIL * vv / root, _SIDE / _TRAIL * speed / root
+    astern_dot = (_SIDE / _TRAIL * 2.0 * va - astern * root_dot) / root
+    back_dot = (_SIDE / _TRAIL * speed_dot - back * root_dot) / root
+    terms = turned + astern, v[1] / _TRAIL - back * v[0], -v[0] / _TRAIL - back * v[1]
     rates = (
         turned_dot + astern_dot,
-        a[1] / TRAIL - back_dot * v[0] - back * a[0],
-        -a[0] / TRAIL - back_dot * v[1] - back * a[1],
+        a[1] / _TRAIL - back_dot * v[0] - back * a[0],
+        -a[0] / _TRAIL - back_dot * v[1] - back * a[1],
     )
     return np.stack(terms), np.stack(rates)
 

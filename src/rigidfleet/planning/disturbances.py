@@ -19,7 +19,7 @@ from rigidfleet.planning import filters
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Mass of a lost vehicle in the control laws [kg]: too small to count, yet nothing is divided by zero.
-NOTHING = 1e-20
+LOST_MASS = 1e-20
 
 
 def mission_disturbance(mission: Mission) -> Disturbance:
@@ -28,6 +28,7 @@ def mission_disturbance(mission: Mission) -> Disturbance:
 
 
 def _draw_disturbance(mission: Mission) -> Disturbance:
+    """All that disturbs a flight of a mission, as tables drawn by its seeds; none if it has no disturbances."""
     d = mission.disturbances
     none = no_disturbance(mission.fleet.mass.copy())
     if d is None:
@@ -128,10 +129,10 @@ def without_lost(
 ) -> Problem:
     """The problem of the remaining agents: only the edges ``kept`` (m,), and no thrust of the agents ``lost`` (N,).
 
-    In the control laws, lost agents have the mass `NOTHING`. The mean mass, which scales the damping ``mu``, is that
+    In the control laws, lost agents have the mass `LOST_MASS`. The mean mass, which scales the damping ``mu``, is that
     of the remaining agents. The equations of motion keep the lost agents and their masses.
     """
-    m = np.where(lost, NOTHING, problem.vehicles.m)
+    m = np.where(lost, LOST_MASS, problem.vehicles.m)
     mean = float(m[~lost].mean()) if not lost.all() else 1.0
     reference, control = problem.reference, problem.control
     return problem._replace(

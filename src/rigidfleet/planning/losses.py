@@ -27,7 +27,7 @@ from rigidfleet.planning.abort import (
     phases_of,
     shortest_time,
 )
-from rigidfleet.planning.clearance import CLOSE, clearance_to, speed_bounds
+from rigidfleet.planning.clearance import CLEARANCE_ACCURACY, clearance_to, speed_bounds
 from rigidfleet.planning.courses import climb_distances, height_above_landing
 from rigidfleet.planning.legs import Leg, depart, leg_from, leg_of, phase_spans
 from rigidfleet.planning.limits import use_of_limits
@@ -152,7 +152,7 @@ def _hits_obstacle(mission: Mission, leg: Leg) -> bool:
     """Whether a leg leads a slot into an obstacle or the ground."""
     planned = sample_leg(leg, FEWEST_SAMPLES)
     near = (clearance_to(planned, x, leg.radius, speed_bounds(planned)) for x in mission.obstacles)
-    return any(x.clearance < -CLOSE for x in near)
+    return any(x.clearance < -CLEARANCE_ACCURACY for x in near)
 
 
 def _quickest_leg(

@@ -24,7 +24,7 @@ _MOST = 2001
 #: Least number of samples of a phase.
 FEWEST_SAMPLES = 11
 #: Number of agents beyond which a tree finds those near each other (`proximity.separation`).
-MANY = 200
+_MANY = 200
 #: Greatest number of positions that a preview computes; counted, not timed, so that it is the same on any machine.
 _PLACES = 4_000_000
 
@@ -83,7 +83,7 @@ def sample_leg(leg: Leg, most: int) -> PlannedPhase:
 
 
 def samples_per_phase(mission: Mission) -> int:
-    """Number of samples of each planned phase; below `MANY` agents, every pair is checked."""
+    """Number of samples of each planned phase; below `_MANY` agents, every pair is checked."""
     n = mission.n_agents
-    each = n * max(1.0, n / 25) if n <= MANY else n
+    each = n * max(1.0, n / 25) if n <= _MANY else n
     return int(_PLACES / each) // len(mission.phases)

@@ -20,7 +20,7 @@ FROM_SPARSE, FROM_ELIMINATION = 180, 60
 #: Greatest number of equations of a dense solve; beyond it, one evaluation takes seconds.
 MOST_DENSE = 2000
 #: Name of each method in reports.
-WORDS: dict[Method, str] = {
+METHOD_WORDS: dict[Method, str] = {
     "dense": "dense factor",
     "elimination": "elimination by 3x3 solves",
     "sparse": "conjugate gradients on the vertex graph, with a kept factor",

@@ -178,6 +178,7 @@ def _descend(control: Floats, duration: float, limits: _Limits, rng: np.random.G
     itself = np.arange(n)
 
     def penalty(y: Floats) -> tuple[float, Floats]:
+        """Weighted squares of what the ways lack or exceed, and their gradient by the free control points."""
         control[free] = y.reshape(shape)
         slope = np.zeros_like(control)
         x = np.tensordot(B, control, axes=1) * limits.metric

@@ -148,15 +148,12 @@ def _phases_to_own_places(
     """
     mistake = partial(error_of_key, mission, number)
     homes = Aborts(mission, (), to="own")
-    problem = (
-        "needs vehicles that stand on the ground at the start, and slots before that are known"
-    )
+    problem = "needs vehicles that stand on the ground at the start, and known slots before"
     steps: tuple[Step, ...] = ()
     if now is not None and now.goal is not None and now.slots is not None and homes.stands:
         steps, _, problem, _ = homes.straight_ways_home(now.goal.r + now.slots @ now.goal.T, now.t)
     if not steps:
-        remedy = "leave places out, to land below"
-        raise mistake("places", "own", problem, remedy)
+        raise mistake("places", "own", problem, "leave places out, to land below")
     least = sum(step.duration for step in steps)
     spare = phase.duration - least if isinstance(phase.duration, float) else 0.0
     if spare < -1e-6:
@@ -224,9 +221,8 @@ def _bent_ways(
     limits, radius = mission.limits, float(mission.fleet.radius.max())
     if limits.speed is None or limits.acceleration is None:
         problem = "is found within limits of speed and acceleration, and the mission lacks one"
-        raise mistake(
-            "transition", phase.transition, problem, "give limits.speed and limits.acceleration"
-        )
+        remedy = "give limits.speed and limits.acceleration"
+        raise mistake("transition", phase.transition, problem, remedy)
     distance = 2.0 * radius + (limits.separation or 0.0) + limits.separation_allowance
     below = max(distance, 2.0 * radius + (limits.separation_below or 0.0))
     room = _ROOM * below
@@ -242,13 +238,10 @@ def _bent_ways(
         )  # fmt: skip
     except ValueError as error:
         problem = f"between '{before}' and '{phase.formation}', {error}"
-        raise mistake(
-            "transition", phase.transition, problem, "or lower limits.separation"
-        ) from None
+        remedy = "or lower limits.separation"
+        raise mistake("transition", phase.transition, problem, remedy) from None
     if ways is None:
-        problem = (
-            f"finds no ways to '{phase.formation}' that keep {distance:.3g} m from centre to centre"
-        )
+        problem = f"finds no ways to '{phase.formation}' that keep centres {distance:.3g} m apart"
         remedy = "use transition = 'layers', place slots farther apart, or lower limits.separation"
         raise mistake("transition", phase.transition, problem, remedy)
     least = math.ceil(ways.duration * 1e3) / 1e3

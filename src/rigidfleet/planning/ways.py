@@ -161,6 +161,10 @@ class _Search:
         return best[0], best[0].stops_of_shorter_way(best[1])
 
     def _roadmap(self, shapes: list[layers.CandidateShape], need: float, *, yawed: bool) -> Roadmap:
+        """What the search goes through: a layer for each shape and attitude, their changes, and where nodes may be.
+
+        ``need`` is the clearance to keep [m]; ``yawed`` asks for more yaws than start, goal and narrow gaps have.
+        """
         frames = layers.lattice_frames(self._near_obstacles_at_rest())
         fence = self.mission.limits.geofence
         box = np.array([[-np.inf] * 3, [np.inf] * 3])
@@ -297,9 +301,7 @@ class _Search:
                     f" '{planned.phase}'"
                 )
             if thing.solid.moves and proved < need:
-                problem = (
-                    f"ways are found round obstacles at rest, and on the one found {self._worst}"
-                )
+                problem = f"ways lead round obstacles at rest, and on this one {self._worst}"
                 remedy = "wait before by kind 'hold', or fly elsewhere first"
                 raise self.mistake("position", self.phase.position, problem, remedy)
         return need - least

@@ -89,7 +89,7 @@ def off_plan(result: Result) -> OffPlan | None:
 @st.styled_figure(lambda result: "bands" in result.statistics, "no log against a plan")
 def plan_and_flight(result: Result) -> Figure:
     """The plan (dashed) and the flight from above, and how far vehicles are from their slots, with what is in doubt."""
-    fig = st.blank_figure(st.WIDTH, 3.9, "constrained")
+    fig = st.blank_figure(st.FIGURE_WIDTH, 3.9, "constrained")
     above, below = fig.subplots(1, 2, width_ratios=(0.8, 1.2))
     st.draw_flight_heading(fig, result, "The flight against its plan")
     off = off_plan(result)

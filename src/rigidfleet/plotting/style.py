@@ -43,7 +43,7 @@ ALERT = "#B00020"
 #: Background of lights.
 NIGHT = "#0B0E16"
 
-WIDTH = 9.0  # width of a figure over time [in]
+FIGURE_WIDTH = 9.0  # width of a figure over time [in]
 _COLUMN = 5.5  # a figure that is narrower has one column of axes [in]
 _PAD = 0.07  # margin around the content [in]
 _DPI = 160  # resolution [pixels per inch]: also of measures, so that a text is measured once
@@ -123,7 +123,7 @@ def figure_width(usual: float) -> float:
 
 def is_narrow() -> bool:
     """Whether figures are to fit one column of a page."""
-    return figure_width(WIDTH) < _COLUMN
+    return figure_width(FIGURE_WIDTH) < _COLUMN
 
 
 def agent_colours(n: int) -> list[str]:
@@ -172,7 +172,7 @@ def time_figure(
     if stacked:
         rows, columns, shares = rows * columns, 1, list(shares) * columns
     whole = 1.3 + height * sum(shares)
-    fig = blank_figure(figure_width(WIDTH), whole, "constrained")
+    fig = blank_figure(figure_width(FIGURE_WIDTH), whole, "constrained")
     # Nearly the heights that the axes will have, as the number of their ticks depends on it
     inside = whole - 1.2 - 2 * _PAD * (rows - 1)
     grid = {"bottom": 0.5 / whole, "top": 1 - 0.7 / whole, "hspace": 2 * _PAD * rows / inside}
@@ -390,7 +390,7 @@ def draw_legend(ax: Axes, handles: Sequence[Any], title: str = "") -> None:
 def legend_columns(handles: Sequence[Any]) -> int:
     """Number of columns of a legend below a figure over time, in which no entry is cut."""
     longest = max((len(str(h.get_label())) for h in handles), default=1)
-    return max(int(16 * (figure_width(WIDTH) - 0.7)) // (longest + 7), 1)
+    return max(int(16 * (figure_width(FIGURE_WIDTH) - 0.7)) // (longest + 7), 1)
 
 
 # -- names of phases ---------------------------------------------------------------------------------
@@ -419,7 +419,7 @@ def _name_phases(axes: Sequence[Axes], result: Result) -> None:
         return
     for label in labels:
         label.remove()
-    letters = int(14 * figure_width(WIDTH))
+    letters = int(14 * figure_width(FIGURE_WIDTH))
     key = textwrap.fill(number_phases(axes, result), letters, max_lines=5, placeholder=" …")
     axes[0].figure.supxlabel(key, fontsize=7.5, color=GREY, parse_math=False)
 

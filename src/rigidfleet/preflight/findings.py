@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
@@ -43,9 +44,9 @@ _MOST_NAMES = 6
 #: Maximum number of equations for which rigidity, and forces at a step, are computed by a dense decomposition.
 DENSE = 600
 #: Number of agents beyond which tracked slots are those of a show, whose edges are not explained.
-MANY = 12
+_MANY = 12
 #: A limit is exceeded only by more than this rounding error.
-SLACK = 1e-9
+LEEWAY = 1e-9
 
 #: Quantities whose worst planned values are shown without a limit, too.
 WORST_SHOWN = ("separation", "speed", "vertical_speed", "thrust")
@@ -360,7 +361,7 @@ class Preflight(Shown):
     @property
     def is_show(self) -> bool:
         """Whether slots alone concern the user: all phases track them, of many agents, or without edges."""
-        many = self.mission.n_agents > MANY or not len(self.mission.edges)
+        many = self.mission.n_agents > _MANY or not len(self.mission.edges)
         tracked = all(phase.tracks_slots for phase in self.mission.phases)
         return self.mission.n_agents > 1 and many and tracked
 
@@ -526,9 +527,7 @@ def _formation_table(formations: Sequence[FormationCheck]) -> FactTable:
         elif f.solve != "dense" or f.skipped:
             row["rigidity"] = f"{'skipped' if f.skipped else 'too large'}, rigidity not checked"
         else:
-            row["rigidity"] = (
-                "its distances do not determine positions, so its rigidity is not checked"
-            )
+            row["rigidity"] = "not checked, since distances do not determine positions"
     return table_of(rows, ("rigidity", "held by"))
 
 
@@ -544,7 +543,7 @@ def _graph_table(formations: Sequence[FormationCheck]) -> FactTable:
     for f in formations:
         row: dict[str, Any] = {"graph": f.name}
         if f.solve != "dense":
-            row["solved by"] = solvers.WORDS[f.solve]
+            row["solved by"] = solvers.METHOD_WORDS[f.solve]
         if (r := f.rigidity) is not None:
             if r.reachable < r.needed:
                 row["reachable rank"] = r.reachable
@@ -552,8 +551,9 @@ def _graph_table(formations: Sequence[FormationCheck]) -> FactTable:
                 names = [f"{i}-{j}" for i, j in (r.edges[r.redundant] + 1).tolist()]
                 row["redundant edges"] = Cell(f"{len(names)}", f"({first_few(names, 6)})")
             if r.flexes:
-                who = [agent_names(flex.agents) for flex in r.flexes]
-                row["free motions"] = Cell(f"{len(who)}", f"({first_few(who, 3, '; ')})")
+                ways = Counter(agent_names(flex.agents) for flex in r.flexes)
+                who = [f"{x} in {k} directions" if k > 1 else x for x, k in ways.items()]
+                row["free motions"] = Cell(f"{len(r.flexes)}", f"({first_few(who, 3, '; ')})")
         if (others := f.realisations) is not None:
             row |= {"random starts": others.starts, "this shape": 0}
             for x in others.shapes:

@@ -29,7 +29,7 @@ from rigidfleet.rigidity import (
 )
 from rigidfleet.rigidity.analysis import WHERE, flatten_points
 from rigidfleet.rigidity.realisations import deform_to_lengths
-from rigidfleet.rigidity.spectrum import MOST as LANCZOS
+from rigidfleet.rigidity.spectrum import MOST_FACTORED as LANCZOS
 from rigidfleet.typing import Floats
 
 _Held = Literal["tracking", "distances", "nothing"]

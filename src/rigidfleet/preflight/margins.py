@@ -26,7 +26,7 @@ from rigidfleet.preflight.findings import FormationMargins, MarginsCheck, Prefli
 from rigidfleet.typing import Floats
 
 #: Number of shapes and attitudes that are taken of a phase, both ends included.
-SHAPES = 7
+_SHAPES = 7
 #: Margins below which a remark is made: 30 degrees and a factor of 2, as is usual in the design of control loops.
 _PHASE, _GAIN = math.radians(30.0), 2.0
 #: Maximum work on margins: sum of the cubes of the sizes of loops, some seconds.
@@ -138,12 +138,12 @@ def _formations_in_words(planned: PlannedPhase) -> str:
 
 
 def _sampled_shapes(planned: PlannedPhase, phase: Phase) -> Floats:
-    """Positions (SHAPES, N, 3) [m], evenly over the change of shape, or over the phase."""
+    """Positions (_SHAPES, N, 3) [m], evenly over the change of shape, or over the phase."""
     shaping = phase.shaping
     t, span = planned.time, planned.time[-1] - planned.time[0]
     if shaping is not None:
         span = min(span, seconds(shaping.blend))
-    at = np.searchsorted(t, t[0] + span * np.linspace(0.0, 1.0, SHAPES))
+    at = np.searchsorted(t, t[0] + span * np.linspace(0.0, 1.0, _SHAPES))
     return planned.position[np.minimum(at, len(t) - 1)]
 
 

@@ -12,9 +12,9 @@ from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Mission, Obstacle
 from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
 from rigidfleet.mission.obstacles import Box, Ground
-from rigidfleet.planning.clearance import CLOSE, clearance_to, speed_bounds
+from rigidfleet.planning.clearance import CLEARANCE_ACCURACY, clearance_to, speed_bounds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
-from rigidfleet.preflight.findings import SLACK, Preflight, Remark, names_with_verb
+from rigidfleet.preflight.findings import LEEWAY, Preflight, Remark, names_with_verb
 from rigidfleet.solids.records import swept_extent
 from rigidfleet.typing import Floats
 
@@ -55,10 +55,10 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             if compared > _COMPARED:
                 break
             clearance, agent, time, proved = clearance_to(planned, thing, radius, paces[k])
-            if clearance - proved > max(unproved.get(b, 0.0), 1.5 * CLOSE):
+            if clearance - proved > max(unproved.get(b, 0.0), 1.5 * CLEARANCE_ACCURACY):
                 unproved[b] = clearance - proved
             # Among equal minima, take the first one: ignore rounding and the last millimetre of a rest.
-            if clearance < worst.get(planned.exact, (np.inf,))[0] - CLOSE:
+            if clearance < worst.get(planned.exact, (np.inf,))[0] - CLEARANCE_ACCURACY:
                 worst[planned.exact] = (clearance, time, agent, planned.phase)
         if compared > _COMPARED:
             skipped = near[rank:][far[:, near[rank:]].min(axis=0) <= 0].tolist()
@@ -110,7 +110,7 @@ def area_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     for (name, exact), (x, phase) in worst.items():
         q, place = QUANTITIES[name], getattr(mission, PLACES[QUANTITIES[name].who])[x.other].name
         limit = q.limit_of(mission)
-        if q.rank(x.value) > q.rank(limit or 0.0) + SLACK:
+        if q.rank(x.value) > q.rank(limit or 0.0) + LEEWAY:
             text = f"{boundary_in_words(name, f'agent {x.who + 1}', place, x.value, x.time)} in '{phase}'"
             text += f" (limit {limit:g} m)" if q.key else ""
             yield Remark("fails" if exact and limit is not None else "note", q.who, text)

@@ -23,7 +23,7 @@ from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.reference import pose_at
 from rigidfleet.planning.vehicles import drag_and_lift
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
-from rigidfleet.preflight.findings import DENSE, SLACK, WORST_SHOWN, Disturbed, Preflight, Remark
+from rigidfleet.preflight.findings import DENSE, LEEWAY, WORST_SHOWN, Disturbed, Preflight, Remark
 from rigidfleet.rigidity import jacobian
 from rigidfleet.typing import Floats
 
@@ -56,8 +56,8 @@ def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
             certificate = planned.leg.certificate or prove_blend(planned.leg.reference, radius)
             crossing, separation = certificate[:3], certificate.separation
             least = min(least, crossing)
-            beyond = flying.all() and (separation <= 0 or separation < limit - SLACK)
-            if beyond and separation < min(ends)[0] - SLACK:
+            beyond = flying.all() and (separation <= 0 or separation < limit - LEEWAY)
+            if beyond and separation < min(ends)[0] - LEEWAY:
                 yield _crossing_remark(mission, planned, crossing)
         for k, at in enumerate(ends):
             least = min(least, at)
@@ -68,7 +68,7 @@ def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
     if np.isfinite(least[0]):
         preflight.worst["separation"] = *least[:2], agent_names(least[2]), mission.limits.separation
     for exact, (at, phase) in worst.items():
-        if at[0] <= 0 or at[0] < limit - SLACK:
+        if at[0] <= 0 or at[0] < limit - LEEWAY:
             yield _collision_remark(mission, at, phase, exact=exact)
 
 
@@ -126,7 +126,7 @@ def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
         text = f"agent {low + 1} is {max(height, 0.0):.2f} m below agent {high + 1} at {t:.2f} s in '{phase}'"
         if limit is None:
             yield Remark("note", "downwash", text)
-        elif height < limit - SLACK:
+        elif height < limit - LEEWAY:
             text += f" (limit {limit:g} m)"
             yield Remark("fails" if exact else "note", "downwash", text)
 
@@ -301,7 +301,7 @@ def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark
         low, high = np.array(fence.min), np.array(fence.max)
         out = np.maximum(low - planned.position, planned.position - high).max(axis=2)
         k, i = np.unravel_index(int(out.argmax()), out.shape)
-        if out[k, i] > SLACK:
+        if out[k, i] > LEEWAY:
             text = f"agent {i + 1} leaves the geofence by {out[k, i]:.2f} m"
             text += f" at {planned.time[k]:.2f} s in '{planned.phase}'"
             yield Remark("fails" if planned.exact else "note", "geofence", text)

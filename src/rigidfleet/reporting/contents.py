@@ -100,6 +100,7 @@ def _names_of(flights: Sequence[Result]) -> list[str]:
 
 
 def _flight_data(result: Result, verdict: Verdict, label: str, colour: str) -> dict[str, Any]:
+    """What the template of a page shows of one flight, by the template's names."""
     mission = result.mission
     judged = [check for check in verdict.checks if check.judged]
     failed = verdict.failures or verdict.undecided_checks

@@ -29,6 +29,7 @@ def gain_lines(mission: Mission) -> list[GainLine]:
 
 
 def _constraint_lines(mission: Mission) -> list[GainLine]:
+    """What the gains of the constraint law mean: name, value and words of each line."""
     c = mission.constraint
     lines = []
     if c.stabilisation == "none":

@@ -24,7 +24,7 @@ _WIDTHS = (2.6, 0.9)  # of lines, first flight to last: each remains visible und
 def svg_of_paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
     """Path of the centre of mass from above, and its height over time, as an SVG."""
     with st.apply_style():
-        fig = st.blank_figure(st.WIDTH, 3.6, "constrained")
+        fig = st.blank_figure(st.FIGURE_WIDTH, 3.6, "constrained")
         above, height = fig.subplots(1, 2)
         for flight, look in zip(flights, _line_looks(flights), strict=True):
             above.plot(flight.cm[:, 0], flight.cm[:, 1], **look)
@@ -44,7 +44,7 @@ def svg_of_time_curves(flights: Sequence[Result], labels: Sequence[str]) -> byte
         panels.insert(1, "clearance")
     with st.apply_style():
         rows = (len(panels) + 1) // 2
-        fig = st.blank_figure(st.WIDTH, 0.6 + 1.9 * rows, "constrained")
+        fig = st.blank_figure(st.FIGURE_WIDTH, 0.6 + 1.9 * rows, "constrained")
         axes = fig.subplots(rows, 2, sharex=True, squeeze=False).ravel()
         for ax, name in zip(axes, panels, strict=False):
             known = False

@@ -113,6 +113,7 @@ def blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
 
 
 def _blocking_stress_or_proof(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
+    """What `blocking_stress` returns of several independent stresses; the search ends once a stress is definite."""
     from scipy.optimize import minimize
 
     unit = np.eye(energy.k)

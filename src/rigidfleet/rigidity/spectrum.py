@@ -17,7 +17,7 @@ _LOWEST = 6
 #: Number of restarts after which eigenvalues not found count as zero; some seconds at 2,000 agents.
 _MOST_RESTARTS = 300
 #: Number of agents beyond which the required factor is too large.
-MOST = 5000
+MOST_FACTORED = 5000
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ _PLANNED = (
     "time", "phase", "cm_reference", "cm_velocity_reference", "attitude_reference", "frame", "rates_reference",
     "distance_reference", "distance_rate_reference", "slot_jerk", "yaw", "yaw_rate",
 )  # fmt: skip
-WORDS = "a smoothing spline, with doubt"
+_WORDS = "a smoothing spline, with doubt"
 
 
 class Doubts(NamedTuple):
@@ -157,7 +157,7 @@ def _likely_flight(
     if plan is None or planned is None:
         blank = Piecewise(whole.time, np.full((*whole.pieces.shape[:2], 1, 1), np.nan))
         judged |= {"agents": read.names, "spans": spans, "since": read.since}
-        flown = result_of_curve(whole.stack(blank), WORDS, **judged)
+        flown = result_of_curve(whole.stack(blank), _WORDS, **judged)
     else:
         flown = replace_ways(plan, planned, whole, spans)
     del whole, planned  # large

@@ -34,7 +34,7 @@ def diagnose(at: PlanIntegration, *, collapsed: bool) -> str:
     if at.solver is not None:
         lost, failed = at.solver.counts.fallbacks, at.solver.counts.failures
         return (
-            f"{head}; the multipliers are solved by {solvers.WORDS[at.plan.method]}, which lost a pivot"
+            f"{head}; the multipliers are solved by {solvers.METHOD_WORDS[at.plan.method]}, which lost a pivot"
             f" {lost} times and found no solution {failed} times. {_remedy(at, collapsed=collapsed)}"
         )
     J, closest, length = _jacobian_and_shortest_edge(at)

@@ -87,7 +87,7 @@ class CurveWatch:
         self.stacks = self.n <= _FEW or limits.separation_below is not None
         #: Whether there are limits by direction: only then is what they limit searched for.
         self.directed = any(getattr(limits, q.name) is not None for q in _DIRECTIONS)
-        count = records.QUANTITIES
+        count = records.EXTREMA
         self.none = np.full(count, np.inf)
         self.none[records.SEPARATION_FLYING] = abs(self.reach)
         self.none[records.HORIZONTAL_SPEED :] = np.inf if self.directed else -np.inf

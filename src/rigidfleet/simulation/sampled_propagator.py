@@ -273,7 +273,7 @@ class SampledPropagator:
         if isinstance(command, AttitudeCommand):
             commands = commands._replace(kind=fleet.ATTITUDE, **arrays)
         else:
-            commands = commands._replace(kind=fleet.ROTORS, speeds=arrays["speed"])
+            commands = commands._replace(kind=fleet.ROTOR_SPEEDS, speeds=arrays["speed"])
         self.flight = self.flight._replace(commands=commands)
 
     def search_extremes(self, *, last: bool) -> None:

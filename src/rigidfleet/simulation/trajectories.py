@@ -51,7 +51,7 @@ _MOST, _TOGETHER = 5e8, 400_000
 _STEP, _SAMPLES, _WATCHED = 0.05, 400_000, 2_000_000
 #: From where on a start, as one before zero, is moved to zero: a time of a clock, not of a flight [s].
 _CLOCK = 1e5
-NAMES = {
+CURVE_NAMES = {
     1: ASSUMED["linear"],
     3: "cubics",
     5: "quintics",
@@ -145,7 +145,7 @@ def trajectories(
     yaws = np.full(shape[:2], np.nan) if yaw is None else _check_numbers("yaw", yaw, *shape[:2])
     x, angle = np.stack(states), np.unwrap(yaws, axis=0)[None, ..., None]
     way, turned = (Piecewise.of_end_states(knots, y[:, first], y[:, first + 1]) for y in (x, angle))
-    how = NAMES[2 * len(states) - 1]
+    how = CURVE_NAMES[2 * len(states) - 1]
     if cubic and len(states) == 1:
         _refuse_jumps(way)
         way, how = Piecewise.cubic_spline(knots, way.at(knots)), ASSUMED["cubic"]

@@ -32,7 +32,7 @@ from rigidfleet.mission.values import Part, key, required_key
 from rigidfleet.sweep import controllers, faults, keypaths
 from rigidfleet.sweep.faults import Drill
 from rigidfleet.sweep.variation import (
-    KINDS,
+    VARIATIONS,
     Gridded,
     NotationError,
     Variation,
@@ -229,7 +229,7 @@ class Sweep:
     def from_json(cls, text: str) -> Self:
         """Restore a sweep from the output of `json`."""
         data = json.loads(text)
-        variations = [KINDS[entry["kind"]].model_validate(entry) for entry in data["vary"]]
+        variations = [VARIATIONS[entry["kind"]].model_validate(entry) for entry in data["vary"]]
         mission = Mission.from_toml(data["mission"], "mission of the sweep")
         header = {key: data[key] for key in SweepHeader.model_fields if key in data}
         return cls(mission, variations, SweepHeader.model_validate(header), data["name"])
@@ -470,7 +470,7 @@ class _SweepDraft:
         for name, default in (("vary", []), ("evaluate", "flight")):
             if self.data.get(name, default) != default:
                 self.add((name,), "has no effect on a drill", "remove it, or [drill]")
-        if drill.files and (flown := drill.model_fields_set & faults.FLOWN.keys()):
+        if drill.files and (flown := drill.model_fields_set & faults.IN_FLIGHT.keys()):
             self.add(("drill", *flown), "needs a mission that is flown", "remove it, or files")
         if not drill.files and all(map(faults.names_mission, drill.stale)):
             for name in drill.model_fields_set.intersection(READING):
@@ -526,7 +526,7 @@ class _SweepDraft:
             except NotationError as error:
                 self.add(where, error.problem, error.remedy)
                 return None
-        model = self.collector.model_class_of_kind(entry, where, KINDS)
+        model = self.collector.model_class_of_kind(entry, where, VARIATIONS)
         variation = None if model is None else self.collector.validate(model, entry, where)
         if variation is None or len(self.collector.findings) > before:
             return None

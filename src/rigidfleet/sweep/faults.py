@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 #: Faults of some vehicles, of the whole show or one vehicle, and those that are flown, with units of their magnitudes.
 PARTIAL = {"late": "s", "another": "", "stale": "", "bias": "m"}
 SETUP = {"rotated": "deg", "shifted": "m", "mirrored": "deg"}
-FLOWN = {"wind": "m/s", "links": "", "lost": ""}
-UNITS = PARTIAL | SETUP | FLOWN
+IN_FLIGHT = {"wind": "m/s", "links": "", "lost": ""}
+FAULTS = PARTIAL | SETUP | IN_FLIGHT
 #: Agents in a message.
 _AGENTS = re.compile(r"\bagent \d+|\bagents \d+(?:, \d+)* and \d+")
 _TURN = 2.0 * np.pi
@@ -74,14 +74,14 @@ class Drill(Part):
 
     def case_grids(self, n: int) -> list[Variation]:
         """The cases of a show of n vehicles as three grids that go together: a drill is a sweep over them."""
-        possible = PARTIAL | SETUP if self.files else UNITS
-        faults, most = self.model_fields_set & UNITS.keys() or possible.keys(), max_fault_sizes(n)
+        possible = PARTIAL | SETUP if self.files else FAULTS
+        faults, most = self.model_fields_set & FAULTS.keys() or possible.keys(), max_fault_sizes(n)
         some = sorted({min(count, n) for count in self.vehicles})
         counts = dict.fromkeys(PARTIAL, some) | dict.fromkeys(SETUP, sorted({1, n}))
         places = range(1, len(self.stale) + 1)
         cases = [
             (fault, float(size), count)
-            for fault in UNITS
+            for fault in FAULTS
             if fault in faults
             for size in (places if fault == "stale" else getattr(self, fault))
             if fault not in most or size <= most[fault]
@@ -139,7 +139,7 @@ def apply_fault(
     document: dict[str, Any], fault: str, size: float, stream: np.random.Generator, n: int, end: float
 ) -> None:  # fmt: skip
     """Put a fault, if it is flown, into the document of a mission of n vehicles that ends at a time [s]."""
-    if fault not in FLOWN:
+    if fault not in IN_FLIGHT:
         return
     place = "network" if fault == "links" else "disturbances"
     table = document[place] = {**document.get(place, {})}
@@ -262,7 +262,7 @@ class Show:
         from rigidfleet.foreign.files import read_trajectories
         from rigidfleet.setpoints import ways_of
         from rigidfleet.simulation.flight import simulate
-        from rigidfleet.simulation.trajectories import NAMES, result_of_trajectories
+        from rigidfleet.simulation.trajectories import CURVE_NAMES, result_of_trajectories
 
         if files:
             read = read_trajectories(
@@ -292,7 +292,7 @@ class Show:
         motion = result.setpoints_at_samples(flown=False)
         if not np.isfinite(motion.state).all():  # where no slots are tracked, vehicles have no file
             motion = result.setpoints_at_samples(flown=True)
-        return ways_of(motion, slice(None)), NAMES[7], assess(result), ()
+        return ways_of(motion, slice(None)), CURVE_NAMES[7], assess(result), ()
 
     def measure_fault(self, fault: GeometricFault) -> tuple[dict[str, float | None], str, str]:
         """What was measured of a fault, the checks that it fails, and the first of these in words."""

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-PASSED, FAILED = "#56B4E9", "#D55E00"
+_PASS_COLOUR, _FAIL_COLOUR = "#56B4E9", "#D55E00"
 #: Maximum number of columns of small axes.
 _COLUMNS = 4
 #: Number of bins of a histogram.
@@ -111,7 +111,7 @@ def success_over_runs(table: Table) -> Figure | None:
     if not len(table.run):
         return None
     reasons = failure_counts(table.reason)
-    fig = _titled_figure(table, "Outcome", st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6))
+    fig = _titled_figure(table, "Outcome", st.FIGURE_WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6))
     left, right = fig.subplots(1, 2, width_ratios=(3, 2))
     n = np.unique(np.geomspace(1, len(table.run), 200).astype(int))
     passed = np.cumsum(table.passed)[n - 1]
@@ -132,7 +132,7 @@ def success_over_runs(table: Table) -> Figure | None:
         right.tick_params(bottom=False, labelbottom=False)
         return fig
     names = [reason_in_words(reason) for reason in reasons]
-    bars = right.barh(names, list(reasons.values()), color=FAILED, height=0.65)
+    bars = right.barh(names, list(reasons.values()), color=_FAIL_COLOUR, height=0.65)
     right.bar_label(bars, padding=3, fontsize=8)
     right.grid(visible=False, axis="y")
     right.set(xlabel="runs")
@@ -153,8 +153,8 @@ def drill_failure_figure(table: Table) -> Figure | None:
         failed = np.array([100.0 * case.failed.rate for case in own])
         labels = [f"{case.magnitude:g}\n{case.vehicles:,}" for case in own]
         x = range(len(own))
-        ax.bar(x, failed, color=FAILED, width=0.7)
-        ax.bar(x, 100.0 - failed, bottom=failed, color=PASSED, width=0.7)
+        ax.bar(x, failed, color=_FAIL_COLOUR, width=0.7)
+        ax.bar(x, 100.0 - failed, bottom=failed, color=_PASS_COLOUR, width=0.7)
         ax.set_xticks(x, labels, fontsize=6.5)
         ax.set(xlim=(-0.6, max(len(own), 4) - 0.4), ylim=(0, 100))
         ax.grid(visible=False)
@@ -195,10 +195,10 @@ def _draw_worst_run(ax: Axes, table: Table, case: Borne) -> None:
     who = [int(x) - 1 for x in re.findall(r"\d+", failure.who.partition(",")[0])]
     xy = result.position[..., :2]
     draw_areas_from_above(ax, table.sweep.mission)
-    ax.plot(*xy[now].T, ".", color=PASSED, markersize=3)
+    ax.plot(*xy[now].T, ".", color=_PASS_COLOUR, markersize=3)
     for i in who:
-        ax.plot(*xy[since : now + 1, i].T, color=FAILED, linewidth=1.0)
-        ax.plot(*xy[now, i], "o", color=FAILED, markersize=3.5)
+        ax.plot(*xy[since : now + 1, i].T, color=_FAIL_COLOUR, linewidth=1.0)
+        ax.plot(*xy[now, i], "o", color=_FAIL_COLOUR, markersize=3.5)
     shown = xy[since : now + 1, who] if who else xy[now : now + 1]
     middle = shown[-1].mean(axis=0)
     half = max(_NEAR, 1.1 * float(np.abs(shown - middle).max()))
@@ -226,7 +226,7 @@ def histograms(table: Table) -> Figure | None:
         low, high = float(x[finite].min()), float(x[finite].max())
         edges = (np.geomspace if scale == "log" else np.linspace)(low, high, _BINS + 1)
         below = np.zeros(_BINS)
-        for some, colour in ((table.passed, PASSED), (~table.passed, FAILED)):
+        for some, colour in ((table.passed, _PASS_COLOUR), (~table.passed, _FAIL_COLOUR)):
             top = below + np.histogram(x[finite & some], edges)[0]
             ax.stairs(top, edges, baseline=below, fill=True, color=colour, linewidth=0)
             below = top
@@ -259,7 +259,7 @@ def metrics_over_drivers(table: Table) -> Figure | None:
     numbers = varied_numbers(table)
     for (name, over), ax in zip(strongest.items(), axes, strict=True):
         x, y = numbers[over], table.metrics[name]
-        for passed, colour in ((True, PASSED), (False, FAILED)):
+        for passed, colour in ((True, _PASS_COLOUR), (False, _FAIL_COLOUR)):
             some = (table.passed == passed) & np.isfinite(y)
             ax.plot(x[some], y[some], ".", color=colour, markersize=2.5, alpha=0.5, rasterized=True)
         centres, low, middle, high = _running_percentiles(x[np.isfinite(y)], y[np.isfinite(y)])
@@ -289,7 +289,7 @@ def correlations(table: Table) -> Figure | None:
         if d.varied in rows:
             values[rows.index(d.varied), columns.index(d.outcome)] = d.correlation
     title = "What drives success and the metrics"
-    fig = _titled_figure(table, title, st.WIDTH, 2.2 + 0.27 * len(rows))
+    fig = _titled_figure(table, title, st.FIGURE_WIDTH, 2.2 + 0.27 * len(rows))
     ax = fig.subplots()
     image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1, aspect="auto")
     names = [c.replace("_", " ") for c in columns]
@@ -355,7 +355,7 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
         if len(inside):
             cells[i, j] = inside.mean() if metric == "success" else np.median(inside)
     title = "Success rate" if metric == "success" else f"Median: {metric.replace('_', ' ')}"
-    fig = _titled_figure(table, title, 0.75 * st.WIDTH, 0.58 * st.WIDTH)
+    fig = _titled_figure(table, title, 0.75 * st.FIGURE_WIDTH, 0.58 * st.FIGURE_WIDTH)
     ax = fig.subplots()
     wide = metric != "success" and _axis_scale(cells[np.isfinite(cells)]) == "log"
     look: dict[str, Any] = {"vmin": 0, "vmax": 100} if metric == "success" else {}
@@ -394,7 +394,7 @@ def _axes_for_metrics(
     """Figure with small axes, one for each metric, in rows of a height [in]."""
     columns = min(_COLUMNS, max(2, len(names)))
     rows = -(-len(names) // columns)
-    fig = _titled_figure(table, title, st.WIDTH, 0.9 + high * rows)
+    fig = _titled_figure(table, title, st.FIGURE_WIDTH, 0.9 + high * rows)
     axes = fig.subplots(rows, columns, squeeze=False).ravel().tolist()
     for ax in axes[len(names) :]:
         ax.set_visible(False)
@@ -404,9 +404,9 @@ def _axes_for_metrics(
 def _draw_run_legend(fig: Figure, table: Table, *, limit: bool = False) -> None:
     from matplotlib.patches import Patch
 
-    handles: list[Any] = [Patch(color=PASSED, label=f"{int(table.passed.sum())} passed")]
+    handles: list[Any] = [Patch(color=_PASS_COLOUR, label=f"{int(table.passed.sum())} passed")]
     if not table.passed.all():
-        handles.append(Patch(color=FAILED, label=f"{int((~table.passed).sum())} failed"))
+        handles.append(Patch(color=_FAIL_COLOUR, label=f"{int((~table.passed).sum())} failed"))
     if limit:
         handles.append(st.legend_entry("limit", color=st.ALERT, linestyle=(0, (6, 2))))
     fig.legend(handles=handles, loc="outside lower left", ncols=len(handles), fontsize=8)

@@ -15,8 +15,7 @@ import numpy as np
 
 from rigidfleet.assessment.fits import fits_by_sample, shape_of_slots
 from rigidfleet.errors import MissionError
-from rigidfleet.mission import Mission
-from rigidfleet.mission.bounds import LENGTH, SPEED
+from rigidfleet.mission import Mission, bounds
 from rigidfleet.mission.formations import coincident_pairs
 from rigidfleet.mission.kinds import seconds
 from rigidfleet.simulation.ensemble import Ensemble, establish, max_edge_error
@@ -86,7 +85,7 @@ def _runs_of_invalid_missions(
     sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats
 ) -> dict[int, tuple[str, str]]:
     """Reason and detail of runs with an invalid mission, by index. Only doubtful missions are checked in full."""
-    bounded = np.all((np.abs(r) <= LENGTH.most) & (np.abs(v) <= SPEED.most), axis=(1, 2))
+    bounded = np.all((abs(r) <= bounds.LENGTH.most) & (abs(v) <= bounds.SPEED.most), axis=(1, 2))
     r, v = (np.where(bounded[:, None, None], x, 0.0) for x in (r, v))
     apart = [not any(coincident_pairs(points)) for points in r.tolist()]
     refusals = {}

@@ -37,7 +37,7 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     rows: list[RunRecord] = []
     groups: dict[int, list[int]] = {}
     for run in runs:
-        if sweep.drill and sweep.values(run)[0] not in faults.FLOWN:
+        if sweep.drill and sweep.values(run)[0] not in faults.IN_FLIGHT:
             rows.append(_judge_fault(sweep, run))
         else:
             groups.setdefault(run // GROUP, []).append(run)
@@ -63,7 +63,7 @@ def flight_with_fault(sweep: Sweep, run: int) -> tuple[Result, Ints]:
     """The flight of a run of a drill again, and which vehicles (M,) it has."""
     from rigidfleet.simulation.flight import simulate
 
-    if sweep.values(run)[0] in faults.FLOWN:
+    if sweep.values(run)[0] in faults.IN_FLIGHT:
         return simulate(sweep.mission_of(run)), np.arange(sweep.mission.n_agents)
     show, fault = _drilled_show_and_fault(sweep, run)
     return show.flight_of_vehicles_near_fault(fault)

@@ -132,6 +132,13 @@ class Store:
         return mask
 
     def _open_database(self, sweep: Sweep) -> None:
+        """Begin the file, or go on with one of the same sweep: it gets the columns that it lacks.
+
+        Raises
+        ------
+        ResultError
+            It has another format, sweep or shard, or more runs.
+        """
         self.runs = sweep.runs
         # A log needs memory that processes share, which a network's disk has not; shards often lie on one.
         self.db.execute(f"PRAGMA journal_mode = {'DELETE' if self.shard else 'WAL'}")

@@ -17,7 +17,7 @@ from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.plain import to_json_data
 from rigidfleet._common.quantities import display_unit
 from rigidfleet.sweep import store
-from rigidfleet.sweep.faults import UNITS
+from rigidfleet.sweep.faults import FAULTS
 from rigidfleet.sweep.metrics import METRICS, readable_unit
 from rigidfleet.sweep.record import reason_in_words
 from rigidfleet.typing import Bools, Floats, Ints
@@ -277,12 +277,12 @@ def failure_rates(table: store.Table) -> list[Borne]:
         fault, size, count = (
             c.variation.decode(x) for c, x in zip(table.sweep.columns, codes.tolist(), strict=True)
         )
-        worst, failed = None, some[~passed]
+        worst, failed, share = None, some[~passed], pass_rate(~passed)
         if len(failed):
             k = failed[np.where(np.isnan(apart[~passed]), np.inf, apart[~passed]).argmin()]
             worst = Example(int(table.run[k]), str(table.detail[k]))
         least = float(np.fmin.reduce(apart)) if np.isfinite(apart).any() else None
-        cases.append(Borne(fault, size, UNITS[fault], int(count), pass_rate(~passed), least, worst))
+        cases.append(Borne(fault, size, FAULTS[fault], int(count), share, least, worst))
     return cases
 
 

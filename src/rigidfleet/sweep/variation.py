@@ -219,7 +219,7 @@ class Geomspace(_Spaced):
 
 _Kind = Normal | Uniform | LogUniform | Choice | Grid | Linspace | Geomspace
 #: Models of variations by `kind`.
-KINDS: dict[str, type[Variation]] = models_by_kind(Annotated[_Kind, Field(discriminator="kind")])
+VARIATIONS = models_by_kind(Annotated[_Kind, Field(discriminator="kind")])
 #: Keys that stand elsewhere in a line than in the brackets.
 _SHARED = {*Gridded.model_fields, "kind"}
 _LINE = re.compile(r"\s*(.+?)\s*(\+=|\*=|=)\s*([\w-]+)\s*\((.*)\)\s*", re.DOTALL)
@@ -239,11 +239,11 @@ def parse_variation(line: str) -> dict[str, Any]:
         raise NotationError("is not a valid variation", _FORM)
     path, sign, kind, inside = match.groups()
     data = {"path": path, "change": _SIGNS[sign], "kind": kind}
-    if kind not in KINDS:
-        remedy = suggest(kind, KINDS) or f"use one of {', '.join(KINDS)}"
+    if kind not in VARIATIONS:
+        remedy = suggest(kind, VARIATIONS) or f"use one of {', '.join(VARIATIONS)}"
         raise NotationError(f"there is no distribution or grid '{kind}'", remedy)
     values = [_parse_value(word) for word in _split_at_commas(inside)]
-    keys = [name for name in KINDS[kind].model_fields if name not in _SHARED]
+    keys = [name for name in VARIATIONS[kind].model_fields if name not in _SHARED]
     if keys == ["values"]:
         return data | {"values": values}
     if len(values) != len(keys):

@@ -44,7 +44,7 @@ _TRIES = 30
 #: Relative size of rounding errors of margins.
 _ROUNDING = 1e-9
 #: Names of the two laws, as `check` has them.
-TRACKING, CONSTRAINT = "tracking", "constraint law"
+_TRACKING, _CONSTRAINT = "tracking", "constraint law"
 
 
 def own_gains(mission: Mission) -> Gains:
@@ -113,9 +113,9 @@ class Screen:
         laws: list[tuple[str, ClosedLoops]] = []
         if lags:
             tracking = tracking_closed_loops(mission, lags)
-            laws += [] if tracking is None else [(TRACKING, tracking)]
+            laws += [] if tracking is None else [(_TRACKING, tracking)]
             looped, _ = loops_and_omission(mission, preview_phases(mission)[0], lags)
-            laws += [(CONSTRAINT, law) for law in looped]
+            laws += [(_CONSTRAINT, law) for law in looped]
         self.parts = _distinct_loop_parts(laws)
         self.own = self.margins_by_law(self.gains)
 

@@ -79,7 +79,7 @@ def monitor_object_code() -> list[bytes]:
     watched, word = (Problem, IntegratorState, Monitor), types.int64
     with_law = Problem, Workspace, IntegratorState, Monitor
     calls = (
-        ("bound_moves", lambda p, s, m: monitor.write_first_step_change_bounds(p, s, m), *watched),
+        ("write_first_step_change_bounds", lambda p, s, m: monitor.write_first_step_change_bounds(p, s, m), *watched),
         ("watch_trail_distances",
          lambda i, j, p, s, m: monitor.watch_trail_distances(i, j, p, s, m), word, word, *watched),
         ("watch_forces", lambda last, p, w, s, m: monitor.watch_forces(last, p, w, s, m), word, *with_law),

@@ -24,8 +24,8 @@ from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, unpack_lan
 from rigidfleet.kernel.disturbances import spline_weights
 from rigidfleet.kernel.engine import lane_steps
 from rigidfleet.kernel.engine.tracer import (
+    INPUTS,
     MOMENT,
-    SOURCES,
     TURN,
     Code,
     FlightTrace,
@@ -315,7 +315,7 @@ def _symbol_evaluator(
         if not isinstance(x, Symbol):
             return simd.lane_constant(x)
         if x.serial not in values:
-            if x.serial in loaded or x.operation in SOURCES:
+            if x.serial in loaded or x.operation in INPUTS:
                 values[x.serial] = load(builder, x)
             else:
                 values[x.serial] = simd.BUILD[x.operation](builder, *map(value, x.arguments))

@@ -119,7 +119,9 @@ class Watch:
 
     def write_first_step_change_bounds(self, problem: Problem, state: IntegratorState) -> None:
         """Bound how far distances change over the first step, into ``monitor.moves``."""
-        library().bound_moves(pack(problem).address, pack(state).address, self.address)
+        library().write_first_step_change_bounds(
+            pack(problem).address, pack(state).address, self.address
+        )
 
     def search_distances(
         self, problem: Problem, state: IntegratorState, first: int, end: int

@@ -22,7 +22,7 @@ ENTRIES = {
     "flight": {
         "integrate": 4,  # problem, workspace, integrator, segment
         "record": 4,  # problem, workspace, segment, record
-        "bound_moves": 3,  # problem, integrator, monitor
+        "write_first_step_change_bounds": 3,  # problem, integrator, monitor
         "watch_trail_distances": 5,  # first, end, problem, integrator, monitor
         "watch_forces": 5,  # last, problem, workspace, integrator, monitor
         "measure": 1,

@@ -27,7 +27,7 @@ from rigidfleet.typing import Floats, Ints
 #: Sources of a symbol's value, in the order in which they become known: numbers of the problem;
 #: numbers of the flight, of the moment (the same for all flights, or by flight), and of its state.
 UNIFORM, FLIGHT, TIME, STATE = range(4)
-SOURCES = {"uniform": UNIFORM, "before": FLIGHT, "time": TIME, "table": TIME, "y": STATE}
+INPUTS = {"uniform": UNIFORM, "before": FLIGHT, "time": TIME, "table": TIME, "y": STATE}
 #: Places among the moment's numbers: blend and two derivatives; time since the reference's piece began; weights of
 #: the gusts' and of the noise's splines.
 BLEND, SINCE, GUST, NOISE, MOMENT = 0, 3, 4, 8, 12
@@ -51,7 +51,7 @@ class Symbol:
         self.trace, self.operation, self.arguments = trace, operation, arguments
         self.serial = len(trace.made)
         knowledge = [x.known for x in arguments if isinstance(x, Symbol)]
-        self.known = SOURCES[operation] if operation in SOURCES else max(knowledge, default=UNIFORM)
+        self.known = INPUTS[operation] if operation in INPUTS else max(knowledge, default=UNIFORM)
 
     def __add__(self, other: Any) -> Any:
         return self.trace.add(self, other)
@@ -468,7 +468,7 @@ class Code:
 
 def _operations_among(symbols: Iterable[Symbol]) -> list[Symbol]:
     """Those that are no sources, in the order in which the kernel computes them."""
-    return sorted((x for x in symbols if x.operation not in SOURCES), key=lambda x: x.serial)
+    return sorted((x for x in symbols if x.operation not in INPUTS), key=lambda x: x.serial)
 
 
 def _distinct_symbols(values: Iterable[Any], knowledge: range) -> list[Symbol]:

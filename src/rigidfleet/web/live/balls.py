@@ -13,7 +13,7 @@ from rigidfleet.typing import Floats
 #: Greatest number of balls at the same time, and in a flight.
 AT_ONCE, IN_A_FLIGHT = 8, 100
 #: Least and greatest radius [m], greatest speed [m/s], and least distance from every vehicle where a ball appears [m].
-SMALLEST, LARGEST, FASTEST, ROOM = 0.1, 5.0, 5.0, 1.0
+SMALLEST, LARGEST, QUICKEST, ROOM = 0.1, 5.0, 5.0, 1.0
 #: A ball that is drawn comes to its goal within about this time [s], and stops nearer than this [m].
 _DRAWN, _THERE = 0.2, 1e-3
 
@@ -50,7 +50,7 @@ class Ball:
             return
         away = self.goal - self.place
         far = float(np.linalg.norm(away))
-        speed = min(far / _DRAWN, FASTEST)
+        speed = min(far / _DRAWN, QUICKEST)
         self.set_velocity(away / far * speed if far > _THERE else np.zeros(3))
 
     def set_velocity(self, velocity: Floats) -> None:

@@ -214,8 +214,8 @@ class Pilot:
             raise ValueError(
                 f"the radius of a ball is {balls.SMALLEST:g} to {balls.LARGEST:g} m, not {radius:g} m"
             )
-        if speed > balls.FASTEST:
-            raise ValueError(f"a ball flies at up to {balls.FASTEST:g} m/s, not {speed:.3g} m/s")
+        if speed > balls.QUICKEST:
+            raise ValueError(f"a ball flies at up to {balls.QUICKEST:g} m/s, not {speed:.3g} m/s")
         away = (
             np.linalg.norm(self._positions() - place, axis=1) - self.mission.fleet.radius - radius
         )

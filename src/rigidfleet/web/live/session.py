@@ -18,7 +18,7 @@ from rigidfleet._common.plain import to_json_data
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.result import Result
-from rigidfleet.web.live.balls import AT_ONCE, FASTEST, LARGEST, SMALLEST
+from rigidfleet.web.live.balls import AT_ONCE, LARGEST, QUICKEST, SMALLEST
 from rigidfleet.web.live.guarding import with_avoidance_or_reason
 from rigidfleet.web.live.pilot import TICK, Pilot
 from rigidfleet.web.replay.page import asset_text, page
@@ -89,7 +89,7 @@ class Session:
             "azimuth": -1.1,
             "formations": self.pilot.formations,
             "unguarded": self.unguarded,
-            "ball": {"radius": [SMALLEST, LARGEST], "speed": FASTEST},
+            "ball": {"radius": [SMALLEST, LARGEST], "speed": QUICKEST},
             "speeds": SPEEDS,
             "loss": None if self.mission.network is None else self.mission.network.loss,
         }
@@ -236,6 +236,7 @@ class Session:
             time.sleep(0.02)
 
     def _fly_in_real_time(self) -> None:
+        """Fly tick by tick at the pace of the clock, and tell pages what is new, until stopped or nobody looks."""
         sent: dict[str, Any] = {}
         due = measured = time.monotonic()
         flown = 0
