@@ -407,9 +407,7 @@ def _geofence_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
     if (limit := q.limit_of(measured.mission)) is None or (e := measured.worst(q.name)) is None:
         return
     words = f"{e.who} comes within {value(-e.value, 'm')} of the geofence at {e.when:.2f} s"
-    if e.value > 0:
-        words = f"{e.who} leaves the geofence by {value(e.value, 'm')} at {e.when:.2f} s"
-    yield limit_check(q, e, limit, words)
+    yield limit_check(q, e, limit, "" if e.value > 0 else words)
 
 
 def _boundary_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:

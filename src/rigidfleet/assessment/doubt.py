@@ -103,6 +103,10 @@ class DrawnWays:
         if name == "people":  # where one falls depends on its velocity, for the time of a fall
             height, gravity = np.ptp(self.result.position[..., 2]), self.result.mission.gravity
             return most + math.sqrt(2.0 * height / gravity) * _estimate_greatest_norm(shifts[:, 1])
+        if q.measure and not q.monitored:  # others' places may count, too
+            r, v, mission = self.result.position, self.result.velocity, self.result.mission
+            by = [q.measure(mission, r + x[0], v + x[1]) for x in shifts]
+            return _estimate_greatest(np.abs(by - q.measure(mission, r, v)))
         values = -self.likely_flight_measurements.closeness.each if name == "clearance" else None
         if name in SAMPLED and q.who == "agent":
             values = self.likely_flight_measurements.samples_of(name).rank

@@ -208,12 +208,7 @@ def limit_check(
         return CheckResult(
             q.name, True, words, None, limit, q.unit, at_least, judged=limit is not None
         )
-    if not words:
-        worst = value(e.value, q.unit)
-        words = q.words.format(worst=worst, who=e.who, when=e.when, limit=limit)
-    if not words:
-        bound = "" if limit is None else f" (limit {limit:g} {q.unit})"
-        words = f"greatest {q.name_in_words} {worst}, {e.who}, at {e.when:.2f} s{bound}"
+    words = words or q.in_words(value(e.value, q.unit), e.who, e.when, limit)
     if e.at_samples:
         words += ", at samples"
     if passed is None and limit is not None:

@@ -477,8 +477,9 @@ def clearance(result: Result) -> Figure:
 
 
 def limited_motions(result: Result) -> list[Quantity]:
-    """Speeds, accelerations and jerks that the mission limits."""
-    return [q for q in MOTIONS if q.limit_of(result.mission) is not None]
+    """What the mission limits of speeds, accelerations, jerks, and what else positions and velocities show."""
+    every = (q for q in QUANTITIES.values() if q in MOTIONS or (q.measure and not q.limit))
+    return [q for q in every if q.limit_of(result.mission) is not None]
 
 
 @st.styled_figure(limited_motions)
