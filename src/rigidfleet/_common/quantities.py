@@ -39,8 +39,11 @@ class Quantity:
         (""), "horizontal" or "vertical", or a quantity of the force that it needs; order 0: it is no such quantity
     scale : factor from values in records to `unit`
     words : about the worst value; "" for "greatest speed 3 m/s, agent 1, at 2.00 s (limit 4 m/s)"
+    praise : what a passed verdict says of {worst}, {who} and {limit}; "" for nothing
+    axis : words on an axis of a figure; "" for its name
     nothing : words if there is nothing to judge; "" for "the flight has no speed to judge"
-    source : what it is judged by where positions over time do not show it, such as "forces"; "" if they do
+    source : what it is judged by where positions over time do not show it, such as "forces"; "" if they do. What ends
+        in "edges" says nothing of a flight without
     monitored : whether the kernel's monitor finds it in continuous time
     by_phase : whether a verdict has its worst value for each phase
     checked : whether a verdict checks or reports it, and a sweep keeps it
@@ -58,6 +61,8 @@ class Quantity:
     way: str = ""
     scale: float = 1.0
     words: str = ""
+    praise: str = ""
+    axis: str = ""
     nothing: str = ""
     source: str = ""
     monitored: bool = False
@@ -105,7 +110,8 @@ def _motion_quantity(order: int, way: str, what: str, unit: str) -> Quantity:
     nothing = "" if order < 3 else "no slots are tracked"
     return Quantity(
         name, unit, f"{text}, if it is limited" if way else text, key=f"limits.{name}", order=order, way=way,
-        nothing=nothing, source="" if order < 3 else "a plan", monitored=order < 3, by_phase=order < 3 and not way,
+        nothing=nothing, source="" if order < 3 else "the jerk of a plan", monitored=order < 3,
+        by_phase=order < 3 and not way,
     )  # fmt: skip
 
 
@@ -126,11 +132,12 @@ QUANTITIES: dict[str, Quantity] = {
             "separation", "m", "least distance between two vehicles' surfaces", "pair", "least", "limits.separation",
             lambda mission: mission.limits.separation_at_all_heights or 0.0, monitored=True, by_phase=True,
             words="{who} come within {worst} of each other at {when:.2f} s (limit {limit:g} m)",
+            praise="agents stay {worst} apart", axis="between agents", nothing="only one agent",
         ),
         Quantity(
             "separation_flying", "m", "the same, one at limits.separation_altitude or above", "pair", "least",
             "limits.separation", lambda m: None if m.limits.separation_altitude is None else m.limits.separation,
-            monitored=True,
+            monitored=True, praise="{worst} in flight",
         ),
         Quantity(
             "separation_as_planned", "m", "greatest distance by which vehicles come nearer than a phase's plan proves",
@@ -139,15 +146,18 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity(
             "clearance", "m", "least distance of a vehicle's surface to an obstacle or the ground", "obstacle",
             "least", limit=lambda mission: 0.0 if mission.obstacles else None, monitored=True, by_phase=True,
+            praise="obstacles stay {worst} away in flight", axis="to obstacles", nothing="no obstacles",
         ),
         Quantity(
             "lost", "m", "least distance of a lost vehicle to one that still flies", "pair", "least",
             limit=lambda mission: None if mission.first_loss == inf else 0.0, monitored=True,
+            praise="lost vehicles stay {worst} away from the others",
         ),
         Quantity(
             "separation_below", "m", "least height between surfaces of two vehicles, one below the other", "pair",
             "least", "limits.separation_below", nothing="no agent flies below another", monitored=True,
             words="{who} fly one below the other, {worst} apart at {when:.2f} s (limit {limit:g} m)",
+            axis="straight below",
         ),
         Quantity(
             "geofence", "m", "greatest distance of a vehicle's centre outside the geofence; negative inside",
@@ -164,6 +174,7 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity(
             "people", "m", "least distance from people, seen from above, at which a vehicle that fails at once falls",
             "people", "least", "limits.people", lambda m: m.limits.people if m.people else None,
+            axis="falls, to people", nothing="no people",
         ),
         Quantity(
             "lowest", "m", "least altitude of a vehicle's centre", sense="least", monitored=True, checked=False,
@@ -182,11 +193,13 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity(
             "thrust", "N", "thrust of the vehicle that comes nearest to its limit; the greatest if none has one",
             key="agents.thrust_limit", order=2, way="thrust", source="forces", monitored=True, by_phase=True,
+            praise="thrust peaks at {worst}",
         ),
         Quantity("thrust_margin", "N", "greatest thrust minus its limit", monitored=True, checked=False),
         Quantity(
             "rotor_force", "N", "force of the rotor that comes nearest to its limit",
             limit=lambda m: [v.rotor_thrust_limit for v in m.vehicle_models or ()], nothing="flown by points",
+            source="forces of rotors", praise="rotors peak at {worst} of {limit}",
         ),
         Quantity(
             "saturation", "%", "greatest share of a phase in which a vehicle is asked for more than its rotors give",
@@ -200,11 +213,11 @@ QUANTITIES: dict[str, Quantity] = {
         ),
         Quantity(
             "tracking_error", "m", "greatest distance of a vehicle from its slot", key="limits.tracking_error",
-            nothing="no slots are tracked", source="a plan",
+            nothing="no slots are tracked", source="a plan", praise="vehicles stay within {worst} of their slots",
         ),
         Quantity(
             "guarantee", "m", "least distance to others or obstacles that is left if vehicles brake at once", "pair",
-            "least",
+            "least", source="avoidance in flight",
         ),
         Quantity("clearance_guarantee", "m", "", "obstacle", "least", checked=False),
         Quantity(
@@ -212,16 +225,17 @@ QUANTITIES: dict[str, Quantity] = {
             source="edges", monitored=True, by_phase=True,
         ),
         Quantity(
-            "constraint_force", "N", "greatest constraint force on a vehicle", source="forces", monitored=True,
-            by_phase=True,
+            "constraint_force", "N", "greatest constraint force on a vehicle", source="forces of edges",
+            monitored=True, by_phase=True,
         ),
         Quantity(
             "tension", "N", "tension of greatest size in an edge; negative: compression", "edge", "size",
-            source="forces", monitored=True, by_phase=True,
+            source="forces of edges", monitored=True, by_phase=True,
         ),
         Quantity(
             "singular_value", "", "least singular value of the constraint Jacobian", "formation", "least",
-            words="smallest singular value of J {worst} at {when:.2f} s", source="edges", by_phase=True,
+            words="smallest singular value of J {worst} at {when:.2f} s", source="a Jacobian of edges",
+            by_phase=True,
         ),
     )
 }  # fmt: skip

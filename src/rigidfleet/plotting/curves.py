@@ -395,25 +395,15 @@ def constraint_error(result: Result) -> Figure:
 # -- clearance ---------------------------------------------------------------------------------------
 
 
-#: Names of the axes of least distances, and what stands where there is none.
-_PANELS = {
-    "separation": ("between agents [m]", "only one agent"),
-    "separation_below": ("straight below [m]", "no agent is ever straight below another"),
-    "clearance": ("to obstacles [m]", "no obstacles"),
-    "people": ("falls, to people [m]", "no people"),
-}
-
-
 def draw_least(ax: Axes, result: Result, name: str) -> None:
     """Least distance to others, to one straight below, to obstacles, or of falls to people, with its limit."""
-    label, nothing = _PANELS[name]
-    ax.set_ylabel(label)
     q, sampled = QUANTITIES[name], samples(result, name)
+    ax.set_ylabel(f"{q.axis} [{q.unit}]")
     values, limit = getattr(result, name, sampled.worst), q.limit_of(result.mission) or 0.0
     values = np.where(np.isfinite(values), values, np.nan)
     if not np.isfinite(values).any():
         known = {"separation": result.n_agents == 1, "clearance": not result.mission.obstacles}
-        st.mark_empty(ax, nothing if known.get(name, True) else "unknown")
+        st.mark_empty(ax, q.nothing if known.get(name, True) else "unknown")
         if limit:
             ax.set_ylim(0.0, 1.4 * limit)
             st.draw_limit(ax, limit, f"limit {limit:g} m")
