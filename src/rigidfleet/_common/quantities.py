@@ -42,8 +42,7 @@ class Quantity:
     praise : what a passed verdict says of {worst}, {who} and {limit}; "" for nothing
     axis : words on an axis of a figure; "" for its name
     nothing : words if there is nothing to judge; "" for "the flight has no speed to judge"
-    source : what it is judged by where positions over time do not show it, such as "forces"; "" if they do. What ends
-        in "edges" says nothing of a flight without
+    source : what it is judged by where positions over time do not show it, such as "forces"; "" if they do
     monitored : whether the kernel's monitor finds it in continuous time
     by_phase : whether a verdict has its worst value for each phase
     checked : whether a verdict checks or reports it, and a sweep keeps it
@@ -78,6 +77,11 @@ class Quantity:
     def at_least(self) -> bool:
         """Whether a limit is the least value allowed, not the greatest."""
         return self.sense == "least"
+
+    @property
+    def of_edges(self) -> bool:
+        """Whether it says nothing of a flight without edges."""
+        return self.source.endswith("edges")
 
     def rank(self, values: Any) -> Any:
         """Numbers that are greater the worse values are."""

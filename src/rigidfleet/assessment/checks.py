@@ -213,16 +213,7 @@ def _result_at_end(
 
 def _waypoint_checks(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     """How far each waypoint is missed, in each quantity, or the one missed the most if all are met."""
-    points = [
-        (p, what, at)
-        for p in phases
-        for what, at in (
-            *((f"point {k} on the way", at) for k, at in enumerate(p.through, start=1)),
-            ("the waypoint", p.waypoint),
-            ("the place at the end", p.stay),
-        )
-        if at is not None
-    ]
+    points = [(p, what, at) for p in phases for what, at in p.points]
     for name, limit in WAYPOINT_TOLERANCE.items():
         every = [(x, p, what, at) for p, what, at in points if (x := getattr(at, name)) is not None]
         failed = [miss for miss in every if not miss[0] <= limit]

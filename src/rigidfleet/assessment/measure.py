@@ -125,7 +125,8 @@ class Measurements:
         """The worst values of each phase, at its samples or between them, by name."""
         every: list[dict[str, Extreme]] = [{} for _ in self.parts]
         phases = [*zip(self.result.phases, self.parts, every, strict=True)]
-        for q in (q for q in QUANTITIES.values() if q.by_phase):
+        edges, every_quantity = len(self.result.edges), QUANTITIES.values()
+        for q in (q for q in every_quantity if q.by_phase and (edges or not q.of_edges)):
             name, ranks, sampled = q.name, self.worst_ranks(q.name), self.samples_of(q.name)
             alone = name not in self.names_recorded
             for (phase, part, worst), rank in zip(phases, ranks, strict=True):

@@ -166,6 +166,13 @@ class PhaseVerdict:
     stay: Waypoint | None
     worst: dict[str, Extreme]
 
+    @property
+    def points(self) -> list[tuple[str, Waypoint]]:
+        """Points to pass on the way, the waypoint and the place to stay, as far as there are any, each in words."""
+        points = [(f"point {k} on the way", w) for k, w in enumerate(self.through, start=1)]
+        ends = ("the waypoint", self.waypoint), ("the place at the end", self.stay)
+        return points + [(what, w) for what, w in ends if w is not None]
+
 
 def keeps_limit(q: Quantity, worst: float, limit: float) -> bool:
     """Whether a worst value keeps its limit."""
@@ -322,19 +329,17 @@ class Verdict(Shown):
 
     def facts(self) -> Sheet:
         """The tables of phases, waypoints and checks, the notes, and the verdict in words."""
-        has_edges = any("constraint" in p.worst for p in self.phases)
         checks = [
             check.fact
             for check in self.checks
-            if (has_edges or not quantity(check.check).source.endswith("edges"))
-            and (check.worst is not None or check.when is not None or not check.passed)
+            if check.worst is not None or check.when is not None or not check.passed
         ]
         meaning = (
             "|c|: how far an edge's length is off the commanded one; the greatest of all edges."
         )
         parts = [
             _phase_table(self.phases),
-            *([Line(meaning)] if has_edges else []),
+            *([Line(meaning)] if "constraint" in self.worst else []),
             _waypoint_table(self.phases),
             table_of_worst_values("check", checks),
             *(Line(f"Note: {note}.", "note") for note in self.notes),
@@ -356,11 +361,11 @@ def _phase_table(phases: list[PhaseVerdict]) -> FactTable:
 
 
 def _waypoint_table(phases: list[PhaseVerdict]) -> FactTable:
-    """Miss of each waypoint, in position, velocity, attitude and rates."""
+    """Miss of each waypoint and place to stay, in position, velocity, attitude and rates."""
     rows = []
     for p in phases:
-        points = [(f"{p.name}, point {k}", w) for k, w in enumerate(p.through, 1)]
-        for name, w in points if p.waypoint is None else [*points, (p.name, p.waypoint)]:
+        for what, w in p.points:
+            name = p.name if w is p.waypoint else f"{p.name}, {what}"
             misses = {f"{what} [{unit}]": getattr(w, what) for what, unit in UNITS.items()}
             rows.append({"waypoint, missed by": name, "at [s]": f"{w.time:.2f}"} | misses)
     return table_of(rows)
