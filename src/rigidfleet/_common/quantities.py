@@ -33,8 +33,8 @@ class Quantity:
     who, sense : whose values they are, and which is the worst
     key : of its limit, as in messages about a mission; "" without one
     limit : from a mission to the limit, or to those of the agents (N,); None: the value of the key
-    measure : from a mission, positions and velocities (K, N, 3) [m, m/s], NaN of lost agents, to the values of agents
-        (K, N) or of the formation (K,), in `unit`; None: another layer measures it
+    measure : from a mission, positions and velocities (K, N, 3) [m, m/s], NaN of lost agents, to the agents' values
+        (K, N) in `unit`; None: another layer measures it
     order, way : the derivative of the position that it is of (1: velocity), and what of it: its size in all directions
         (""), "horizontal" or "vertical", or a quantity of the force that it needs; order 0: it is no such quantity
     scale : factor from values in records to `unit`
@@ -95,8 +95,7 @@ class Quantity:
             return self.words.format(worst=worst, who=who, when=when, limit=limit)
         bound = "" if limit is None else f" (limit {limit:g} {self.unit})"
         sense = "least" if self.at_least else "greatest"
-        whose = f", {who}" * bool(who)
-        return f"{sense} {self.name_in_words} {worst}{whose}, at {when:.2f} s{bound}"
+        return f"{sense} {self.name_in_words} {worst}, {who}, at {when:.2f} s{bound}"
 
     def limit_of(self, mission: Any) -> Any:
         """The limit that a mission sets, in `unit`, or those of the agents; None if it sets none."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity
+from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, display_unit
 from rigidfleet.math import attitude as att
 from rigidfleet.plotting import quadrotors
 from rigidfleet.plotting import style as st
@@ -396,9 +396,10 @@ def constraint_error(result: Result) -> Figure:
 
 
 def draw_least(ax: Axes, result: Result, name: str) -> None:
-    """Least distance to others, to one straight below, to obstacles, or of falls to people, with its limit."""
+    """Least values, such as distances to others, to obstacles, or of falls to people, with their limit."""
     q, sampled = QUANTITIES[name], samples(result, name)
-    ax.set_ylabel(f"{q.axis} [{q.unit}]")
+    unit = display_unit(q.unit)
+    ax.set_ylabel(f"{q.axis or q.name_in_words} [{unit}]")
     values, limit = getattr(result, name, sampled.worst), q.limit_of(result.mission) or 0.0
     values = np.where(np.isfinite(values), values, np.nan)
     if not np.isfinite(values).any():
@@ -406,10 +407,10 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
         st.mark_empty(ax, q.nothing if known.get(name, True) else "unknown")
         if limit:
             ax.set_ylim(0.0, 1.4 * limit)
-            st.draw_limit(ax, limit, f"limit {limit:g} m")
+            st.draw_limit(ax, limit, f"limit {limit:g} {unit}")
         return
     ax.plot(result.time, values, color=st.TONES[0])
-    st.draw_limit(ax, limit, f"limit {limit:g} m" if limit or name == "people" else "contact")
+    st.draw_limit(ax, limit, f"limit {limit:g} {unit}" if limit or name == "people" else "contact")
     if name == "separation":
         _draw_planned_separation(ax, result)
         if (flying := QUANTITIES["separation_flying"].limit_of(result.mission)) is not None:
@@ -424,7 +425,7 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
     look: dict[str, Any] = {"markerfacecolor": "none", "markeredgecolor": st.INK}
     ax.plot(x.time, x.value, "o", markersize=5, clip_on=False, **look)
     who = st.clean_name(owner_name(result, q, x.who, x.other))
-    st.write_above(ax, f"least {x.value:.3g} m at {x.time:.2f} s, {who}")
+    st.write_above(ax, f"least {x.value:.3g} {unit} at {x.time:.2f} s, {who}")
     low, high = min(float(np.nanmin(values)), limit), max(float(np.nanmax(values)), limit)
     room = 0.25 * max(high, -low, 0.1)
     ax.set_ylim(min(low, 0.0) - room, max(high, 0.0) + room)
@@ -478,6 +479,6 @@ def motion(result: Result) -> Figure:
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]
     fig, axes = st.time_figure(result, "Speed, acceleration and jerk", len(drawn), height=1.8)
     for q, ax in zip(drawn, axes, strict=True):
-        quadrotors.draw_with_limit(ax, result, q.name)
+        (draw_least if q.at_least else quadrotors.draw_with_limit)(ax, result, q.name)
     st.draw_agents_legend(axes[0], result.n_agents)
     return fig

@@ -142,8 +142,7 @@ def _worst_value_when_who_limit(
     room = q.rank(limits) if np.isfinite(limits).any() else 0.0
     planned, x = max(zip(way, values, strict=True), key=lambda pair: (q.rank(pair[1]) - room).max())
     k, i = np.unravel_index(int((q.rank(x) - room).argmax()), x.shape)
-    who = f"agent {i + 1}" if q.who == "agent" else ""
-    return float(x[k, i]), float(planned.time[k]), who, float(limits[i])
+    return float(x[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])
 
 
 def _measured_peaks(
@@ -152,9 +151,9 @@ def _measured_peaks(
     """Of what has a limit and is measured of positions and velocities: what is nearest to it, at samples."""
     for q in (q for q in QUANTITIES.values() if q.checked and way):
         if (measure := q.measure) and (limit := q.limit_of(mission)) is not None:
-            every = (measure(mission, x.position, x.velocity) for x in way)
-            values = [x.reshape(len(x), -1) for x in every]
-            yield q, _worst_value_when_who_limit(q, way, values, np.full(values[0].shape[1], limit))
+            values = [measure(mission, x.position, x.velocity) for x in way]
+            limits = np.full(mission.n_agents, limit)
+            yield q, _worst_value_when_who_limit(q, way, values, limits)
 
 
 def find_planned_peaks(mission: Mission, preflight: Preflight) -> None:

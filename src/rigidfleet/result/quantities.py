@@ -28,7 +28,7 @@ class Samples:
     rank : of each value (K, places): greater is worse; -infinity if the value is not finite
     """
 
-    def __init__(self, q: Quantity, values: Floats, owner: Owner = lambda _k, i=0: (i, -1)) -> None:
+    def __init__(self, q: Quantity, values: Floats, owner: Owner = lambda _k, i: (i, -1)) -> None:
         self.quantity, self.values, self.owner = q, values, owner
         rank = q.rank(values)
         if not rank.max(initial=-np.inf) < np.inf:  # nor is NaN
@@ -116,7 +116,7 @@ def _distance_to_lost(result: Result) -> tuple[Floats, Owner]:
 
 
 def _measures_of_states(result: Result, q: Quantity) -> tuple[Floats, ...]:
-    """Values (K, N), or of the formation (K,), of what positions and velocities show by themselves."""
+    """Values (K, N) of what positions and velocities show by themselves."""
     assert q.measure is not None
     states = (mask_lost(result, x) for x in (result.position, result.velocity))
     return (q.measure(result.mission, *states),)
@@ -172,5 +172,5 @@ SAMPLED: dict[str, Callable[[Result], tuple[Any, ...]]] = {
     "constraint": lambda r: _with_edge_owners(r, np.abs(r.constraint)),
     "tension": lambda r: _with_edge_owners(r, -r.multiplier),
     "constraint_force": lambda r: (mask_lost(r, norms(r.constraint_force)),),
-    "singular_value": lambda r: (r.singular_value,),
+    "singular_value": lambda r: (r.singular_value, lambda _k: (0,)),
 }
