@@ -14,7 +14,7 @@ import pytest
 import rigidfleet as rf
 from rigidfleet.cli.app import BAD_INPUT, FAILED, PASSED, main
 from rigidfleet.foreign import shows, texts
-from rigidfleet.foreign.files import read_trajectories
+from rigidfleet.foreign.files import SUFFIXES, read_trajectories
 from rigidfleet.simulation.trajectories import result_of_trajectories
 
 SEVEN = Path(__file__).parent / "data" / "sequence_trajectories"
@@ -583,3 +583,10 @@ def test_vehicles_with_numbers_for_names_are_in_their_order(tmp_path):
         table = tmp_path / "log.csv"
         table.write_text("\n".join(["time,agent,x,y,z", *first, *rows[3:]]) + "\n")
         assert read_trajectories(table, spans="stand").names == ("1", "2", "10")
+
+
+def test_help_names_every_kind_of_file_that_is_read(capsys):
+    """Each suffix by which a file of a folder is read stands in the help of `assess`."""
+    assert main(["assess", "--help"]) == PASSED
+    words = capsys.readouterr().out.replace("CSV", ".csv")
+    assert all(suffix in words for suffix in (*SUFFIXES, ".bin") if suffix != ".zstd")  # packed

@@ -19,7 +19,9 @@ from test_sweep import everything
 import rigidfleet as rf
 from rigidfleet import plotting
 from rigidfleet._common.facts import Fact, FactTable, Line, Row, Sheet, table_of_worst_values, value
+from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet._common.text import all_hold_in_words
+from rigidfleet._common.waypoints import UNITS
 from rigidfleet.cli import app, console
 from rigidfleet.math.margins import Margins
 from rigidfleet.mission import mission_names
@@ -186,6 +188,42 @@ def test_a_verdict_shows_what_its_json_holds(flights, which):
         ]  # fmt: skip
         wanted = [x for x in wanted if x is not None]
         assert all(near(x, y) for x, y in zip(numbers, wanted, strict=True)), row
+
+
+@pytest.mark.parametrize("name", ["bridge-inspection", "ferris-wheel", "hexagon", "market-square"])
+def test_a_verdict_has_one_set_of_facts(name):
+    """Name, value, unit and level of what has a value are the same in tables and JSON; misses are those of the checks.
+
+    Of a flight without edges, neither has anything of edges.
+    """
+    verdict = rf.assess(rf.simulate(name))
+    data = json.loads(verdict.json())
+    tables = {x.heads[0]: x for x in verdict.facts().shown_parts if isinstance(x, FactTable)}
+    shown = {(*map(str, row.cells[:2]), row.level) for row in tables["check"].rows if row.cells[1]}
+    judged = {True: "ok", False: ""}
+    held = {
+        (
+            c["check"].replace("_", " ") + ", at samples" * c["at_samples"], value(c["worst"], c["unit"]),
+            judged[c["judged"]] if c["passed"] else "fails",
+        )
+        for c in data["checks"] if c["worst"] is not None
+    }  # fmt: skip
+    assert shown == held
+    points = [
+        (w["time"], *(w[x] for x in UNITS))
+        for p in data["phases"]
+        for w in (*p["through"], p["waypoint"], p["stay"])
+        if w is not None
+    ]
+    table = tables.get("waypoint, missed by", FactTable(("", ""), []))
+    assert [row.cells[1:] for row in table.rows] == [[f"{t:.2f}", *x] for t, *x in points]
+    worst = {c["check"]: c["worst"] for c in data["checks"]}
+    for k, what in enumerate(UNITS):
+        misses = [point[1 + k] for point in points if point[1 + k] is not None]
+        assert worst.get(f"waypoint_{what}") == max(misses, default=None)
+    edges = {name for name, q in QUANTITIES.items() if q.of_edges}
+    for keys in (worst, data["worst"], *(p["worst"] for p in data["phases"])):
+        assert bool(edges & keys.keys()) == (name != "market-square")
 
 
 @pytest.mark.parametrize("name", ["narrow-passage", "crazyflies", "market-square", "show"])

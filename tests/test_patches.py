@@ -19,8 +19,8 @@ ROOT = Path(__file__).parents[1]
 PATCHES = ROOT / "tests" / "patches"
 #: Most files of `src` that each task may touch.
 TASKS = {
-    "add_a_controller": 4, "add_a_kind_of_phase": 3, "add_a_limit": 2, "change_a_message_everywhere": 1,
-    "find_eq_12": 0, "say_why_a_flight_failed": 0,
+    "add_a_controller": 4, "add_a_kind_of_phase": 3, "add_a_limit": 2, "add_a_quantity": 2,
+    "change_a_message_everywhere": 1, "find_eq_12": 0, "say_why_a_flight_failed": 0,
 }  # fmt: skip
 
 

@@ -213,16 +213,7 @@ def _result_at_end(
 
 def _waypoint_checks(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     """How far each waypoint is missed, in each quantity, or the one missed the most if all are met."""
-    points = [
-        (p, what, at)
-        for p in phases
-        for what, at in (
-            *((f"point {k} on the way", at) for k, at in enumerate(p.through, start=1)),
-            ("the waypoint", p.waypoint),
-            ("the place at the end", p.stay),
-        )
-        if at is not None
-    ]
+    points = [(p, what, at) for p in phases for what, at in p.points]
     for name, limit in WAYPOINT_TOLERANCE.items():
         every = [(x, p, what, at) for p, what, at in points if (x := getattr(at, name)) is not None]
         failed = [miss for miss in every if not miss[0] <= limit]
@@ -407,9 +398,7 @@ def _geofence_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
     if (limit := q.limit_of(measured.mission)) is None or (e := measured.worst(q.name)) is None:
         return
     words = f"{e.who} comes within {value(-e.value, 'm')} of the geofence at {e.when:.2f} s"
-    if e.value > 0:
-        words = f"{e.who} leaves the geofence by {value(e.value, 'm')} at {e.when:.2f} s"
-    yield limit_check(q, e, limit, words)
+    yield limit_check(q, e, limit, "" if e.value > 0 else words)
 
 
 def _boundary_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:

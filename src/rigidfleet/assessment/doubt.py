@@ -30,11 +30,9 @@ from rigidfleet.result import Result
 from rigidfleet.result.quantities import SAMPLED, norms
 from rigidfleet.typing import Floats, Ints
 
-#: What positions do not show: checks of a log leave it out.
-_UNSEEN = {
-    "record", "settled", "thrust", "thrust_peak", "rotor_force", "saturation", "tilt", "guarantee", "constraint_force",
-    "tension", "singular_value", "jerk", "horizontal_jerk", "vertical_jerk", "waypoint_attitude", "waypoint_rates",
-}  # fmt: skip
+#: What a log does not show of what is no quantity, which checks leave out; sources of quantities that it shows.
+_UNSEEN = ("record", "settled", "waypoint_attitude", "waypoint_rates")
+_SEEN = ("", "a plan", "edges")
 #: Checks of shapes; those of a moment, at the end of a phase; those of which nothing is in doubt.
 _SHAPES = ("shape", "distances", "order", "handedness", "flip")
 _AT_END = (*_SHAPES, "waypoint_position", "waypoint_velocity", "touch_down", "corner")
@@ -103,6 +101,10 @@ class DrawnWays:
         if name == "people":  # where one falls depends on its velocity, for the time of a fall
             height, gravity = np.ptp(self.result.position[..., 2]), self.result.mission.gravity
             return most + math.sqrt(2.0 * height / gravity) * _estimate_greatest_norm(shifts[:, 1])
+        if q.measure and not q.monitored:  # others' places may count, too
+            r, v, mission = self.result.position, self.result.velocity, self.result.mission
+            by = [q.measure(mission, r + x[0], v + x[1]) for x in shifts]
+            return _estimate_greatest(np.abs(by - q.measure(mission, r, v)))
         values = -self.likely_flight_measurements.closeness.each if name == "clearance" else None
         if name in SAMPLED and q.who == "agent":
             values = self.likely_flight_measurements.samples_of(name).rank
@@ -164,16 +166,18 @@ def verdict_with_intervals(
     checks, resets = [], facts.get("resets_s", [])
     for check in verdict.checks:
         name, why = check.check, "" if deviations else "the noise is not told. State it: --noise"
+        if name in _UNSEEN or quantity(name).source not in _SEEN:
+            continue
         if not common_clock and _is_of_pairs(name):
             why = "vehicles have no common clock"
             check = replace(check, worst=None, first=None)  # noqa: PLW2901
-        if deviations and not why and name not in (*_CERTAIN, *_UNSEEN):
+        if deviations and not why and name not in _CERTAIN:
             check = _with_interval(check, deviations.uncertainty_of(check), facts["noise_m"])  # noqa: PLW2901
             check = _leave_open_at_reset(check, resets)  # noqa: PLW2901
         elif why and check.judged and name not in _CERTAIN:
             words = f"{name.replace('_', ' ')} is not judged: {why}"
             check = replace(check, passed=False, undecided=True, message=words)  # noqa: PLW2901
-        checks += [check] * (name not in _UNSEEN)
+        checks.append(check)
     return replace(verdict, checks=checks, doubt=facts, notes=[*doubt_notes(facts), *verdict.notes])
 
 

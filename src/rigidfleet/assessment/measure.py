@@ -27,13 +27,12 @@ from rigidfleet.result.quantities import (
 )
 from rigidfleet.typing import Bools, Floats, Ints
 
-#: Share by which a sample may be worse than the worst value of its phase; beyond it, the record contradicts itself.
-#: Forces have no such bound: a peak is searched only where the ends of a step show one, so that a jump of a user's
-#: force may be missed.
-_SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
-
-#: Quantities of which a phase between samples has a worst value.
+#: Quantities of which the record of a phase has a worst value between samples, in files of every version.
 _DUE = ("speed", "lowest", "highest", "thrust", "separation", "clearance", "geofence")
+#: Share by which a sample may be worse than that, for rounding; beyond it, the record contradicts itself. Forces have
+#: no such bound: a peak is searched only where the ends of a step show one, so that a jump of a user's force may be
+#: missed.
+_SLACK = {x: 1e-9 * QUANTITIES[x].order for x in _DUE if not QUANTITIES[x].source}
 
 #: What a phase is judged by at its end.
 _ENDS = ("target", "stay")
@@ -126,7 +125,8 @@ class Measurements:
         """The worst values of each phase, at its samples or between them, by name."""
         every: list[dict[str, Extreme]] = [{} for _ in self.parts]
         phases = [*zip(self.result.phases, self.parts, every, strict=True)]
-        for q in (q for q in QUANTITIES.values() if q.by_phase):
+        edges, every_quantity = len(self.result.edges), QUANTITIES.values()
+        for q in (q for q in every_quantity if q.by_phase and (edges or not q.of_edges)):
             name, ranks, sampled = q.name, self.worst_ranks(q.name), self.samples_of(q.name)
             alone = name not in self.names_recorded
             for (phase, part, worst), rank in zip(phases, ranks, strict=True):

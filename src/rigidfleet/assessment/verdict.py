@@ -21,7 +21,7 @@ from rigidfleet._common.facts import (
 from rigidfleet._common.plain import to_json_data
 from rigidfleet._common.quantities import QUANTITIES, Quantity, quantity
 from rigidfleet._common.text import all_hold_in_words
-from rigidfleet._common.waypoints import SHAPE_TOLERANCE, WAYPOINT_TOLERANCE
+from rigidfleet._common.waypoints import SHAPE_TOLERANCE, UNITS, WAYPOINT_TOLERANCE
 
 #: Share of a limit, or of a unit if this is more, by which rounding may exceed it.
 LEEWAY = 1e-9
@@ -31,26 +31,17 @@ TOUCH_DOWN = 0.5
 FLIPPED = 90.0
 #: Depth below z = 0 from which an agent is noted if the mission has no ground there [m].
 DIP = 0.01
-#: Checks that say nothing of a flight without edges.
-_OF_EDGES = {"constraint", "constraint_force", "tension", "singular_value"}
 #: Levels of words for a verdict.
 _LEVELS: dict[str, Level] = {"passed": "ok", "failed": "fails", "undecided": "undecided"}
-#: What a passed verdict says about a check's worst value.
+#: What a passed verdict says about the worst value of a check that is of no quantity as a whole.
 _PRAISE = {
     "shape": "shapes are within {worst}",
     "waypoint_position": "waypoints are met within {worst}",
-    "separation": "agents stay {worst} apart",
-    "separation_flying": "{worst} in flight",
-    "clearance": "obstacles stay {worst} away in flight",
     "clearance_start": "agents start {worst} above an obstacle",
     "clearance_end": "agents land {worst} above an obstacle",
-    "lost": "lost vehicles stay {worst} away from the others",
     "abandoned": "phases abandoned after {who}: {worst}",
     "way_home": "{worst} apart on the way home, of {limit} promised",
     "thrust_peak": "thrust peaks at {worst} ({who})",
-    "thrust": "thrust peaks at {worst}",
-    "rotor_force": "rotors peak at {worst} of {limit}",
-    "tracking_error": "vehicles stay within {worst} of their slots",
 }
 
 
@@ -115,17 +106,8 @@ class CheckResult:
             when, who = self.first.when, f"first {self.first.who}"
         level = "fails" if not self.passed else "ok" if self.judged else ""
         level = "undecided" if self.undecided else level
-        return Fact(
-            self.name,
-            self.worst,
-            self.unit,
-            self.limit,
-            self.at_least,
-            when,
-            who,
-            level,
-            self.interval,
-        )
+        bound = self.limit, self.at_least
+        return Fact(self.name, self.worst, self.unit, *bound, when, who, level, self.interval)
 
     def fill(self, words: str) -> str:
         """Words with {worst}, {limit} and {who} put in."""
@@ -184,6 +166,13 @@ class PhaseVerdict:
     stay: Waypoint | None
     worst: dict[str, Extreme]
 
+    @property
+    def points(self) -> list[tuple[str, Waypoint]]:
+        """Points to pass on the way, the waypoint and the place to stay, as far as there are any, each in words."""
+        points = [(f"point {k} on the way", w) for k, w in enumerate(self.through, start=1)]
+        ends = ("the waypoint", self.waypoint), ("the place at the end", self.stay)
+        return points + [(what, w) for what, w in ends if w is not None]
+
 
 def keeps_limit(q: Quantity, worst: float, limit: float) -> bool:
     """Whether a worst value keeps its limit."""
@@ -208,12 +197,7 @@ def limit_check(
         return CheckResult(
             q.name, True, words, None, limit, q.unit, at_least, judged=limit is not None
         )
-    if not words:
-        worst = value(e.value, q.unit)
-        words = q.words.format(worst=worst, who=e.who, when=e.when, limit=limit)
-    if not words:
-        bound = "" if limit is None else f" (limit {limit:g} {q.unit})"
-        words = f"greatest {q.name_in_words} {worst}, {e.who}, at {e.when:.2f} s{bound}"
+    words = words or q.in_words(value(e.value, q.unit), e.who, e.when, limit)
     if e.at_samples:
         words += ", at samples"
     if passed is None and limit is not None:
@@ -314,36 +298,22 @@ class Verdict(Shown):
             head = f"{self.word.capitalize()}: {len(some)} of {len(judged)} checks."
             return "\n".join([head, *(f"- {check.message}" for check in lines)])
         by_check = {f.check: f for f in self.checks if f.worst is not None}
-        praise = dict(_PRAISE)
+        praise = {name: _PRAISE.get(name, quantity(name).praise) for name in by_check}
         if "thrust_peak" in by_check:
             praise["thrust"] = "{who} comes nearest to its limit, at {worst} of {limit}"
-        praise_lines = [
-            by_check[name].fill(words) for name, words in praise.items() if name in by_check
-        ]
+        praise_lines = [by_check[name].fill(words) for name, words in praise.items() if words]
         head = f"Passed: {all_hold_in_words(len(judged))}"
         return (f"{head}; {', '.join(praise_lines)}." if praise_lines else f"{head}.") + self.covers
 
     def to_dict(self) -> dict[str, Any]:
         """The verdict as plain data that JSON can hold; None for what does not apply."""
-        return to_json_data(
-            {
-                "mission": self.mission,
-                "title": self.title,
-                "passed": self.passed,
-                "summary": self.summary,
-                "tolerances": {
-                    "shape": SHAPE_TOLERANCE,
-                    "waypoint": WAYPOINT_TOLERANCE,
-                    "flip": FLIPPED,
-                },
-                "checks": self.checks,
-                "notes": self.notes,
-                "read": self.read,
-                "worst": self.worst,
-                "phases": self.phases,
-            }
-            | ({} if self.doubt is None else {"verdict": self.word, "doubt": self.doubt})
-        )
+        data = {
+            "mission": self.mission, "title": self.title, "passed": self.passed, "summary": self.summary,
+            "tolerances": {"shape": SHAPE_TOLERANCE, "waypoint": WAYPOINT_TOLERANCE, "flip": FLIPPED},
+            "checks": self.checks, "notes": self.notes, "read": self.read, "worst": self.worst, "phases": self.phases,
+        }  # fmt: skip
+        doubt = {} if self.doubt is None else {"verdict": self.word, "doubt": self.doubt}
+        return to_json_data(data | doubt)
 
     def json(self) -> str:
         """The verdict as JSON text."""
@@ -359,19 +329,17 @@ class Verdict(Shown):
 
     def facts(self) -> Sheet:
         """The tables of phases, waypoints and checks, the notes, and the verdict in words."""
-        has_edges = any("constraint" in p.worst for p in self.phases)
         checks = [
             check.fact
             for check in self.checks
-            if (has_edges or check.check not in _OF_EDGES)
-            and (check.worst is not None or check.when is not None or not check.passed)
+            if check.worst is not None or check.when is not None or not check.passed
         ]
         meaning = (
             "|c|: how far an edge's length is off the commanded one; the greatest of all edges."
         )
         parts = [
             _phase_table(self.phases),
-            *([Line(meaning)] if has_edges else []),
+            *([Line(meaning)] if "constraint" in self.worst else []),
             _waypoint_table(self.phases),
             table_of_worst_values("check", checks),
             *(Line(f"Note: {note}.", "note") for note in self.notes),
@@ -393,13 +361,11 @@ def _phase_table(phases: list[PhaseVerdict]) -> FactTable:
 
 
 def _waypoint_table(phases: list[PhaseVerdict]) -> FactTable:
-    """Miss of each waypoint, in position, velocity, attitude and rates."""
+    """Miss of each waypoint and place to stay, in position, velocity, attitude and rates."""
     rows = []
     for p in phases:
-        points = [(f"{p.name}, point {k}", w) for k, w in enumerate(p.through, 1)]
-        for name, w in points if p.waypoint is None else [*points, (p.name, p.waypoint)]:
-            rows.append({
-                "waypoint, missed by": name, "at [s]": f"{w.time:.2f}", "position [m]": w.position,
-                "velocity [m/s]": w.velocity, "attitude [deg]": w.attitude, "rates [deg/s]": w.rates,
-            })  # fmt: skip
+        for what, w in p.points:
+            name = p.name if w is p.waypoint else f"{p.name}, {what}"
+            misses = {f"{what} [{unit}]": getattr(w, what) for what, unit in UNITS.items()}
+            rows.append({"waypoint, missed by": name, "at [s]": f"{w.time:.2f}"} | misses)
     return table_of(rows)

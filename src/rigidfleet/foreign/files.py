@@ -42,8 +42,8 @@ _REFUSED = {
 }
 #: Suffixes of recordings and logs, which may be longer than what is read as a whole, and of all files of trajectories
 #: in a folder. Files ``.bin`` are logs only by their content.
-_RECORDINGS, _LOGS = {".mcap", ".db3", ".zstd"}, {".ulg", ".tlog"}
-_SUFFIXES = {".csv", ".skyc"} | _RECORDINGS | _LOGS
+_RECORDINGS, _LOGS = (".mcap", ".db3", ".zstd"), (".ulg", ".tlog")
+SUFFIXES = (".csv", ".skyc", *_RECORDINGS, *_LOGS)
 #: A time between two samples that is noted, and one that is refused, in usual steps (medians) of the vehicle; repeated
 #: positions that are noted.
 _NOTED, _LONGEST, _REPEATED = 1.5, 10.0, 5
@@ -67,9 +67,9 @@ def read_trajectories(
     Parameters
     ----------
     files : a table of setpoints (CSV with a header, for one vehicle or with a column ``agent``), a table of polynomials
-        (Crazyswarm2's CSV, one vehicle), a show (``.skyc``), a recording of ROS 2 (``.mcap``, ``.db3``), a log of an
-        autopilot (``.ulg``, ``.tlog``, ``.bin``), or a folder: each CSV or log in it is a vehicle, each folder in it a
-        vehicle whose CSVs, in the order of their numbers, follow each other; or a folder that rosbag2 wrote
+        (Crazyswarm2's CSV, one vehicle), a show, a recording of ROS 2, a log of an autopilot (`SUFFIXES`), or a folder:
+        each CSV or log in it is a vehicle, each folder in it a vehicle whose CSVs, in the order of their numbers,
+        follow each other; or a folder that rosbag2 wrote
     interpolation : between samples, ``cubic`` (the cubic spline through the positions, with continuous acceleration) or
         ``linear``; formats of polynomials say themselves what is between
     spans : what a vehicle does that has samples later than others, or no longer, by more than its usual step: it
@@ -240,7 +240,7 @@ def groups_of_files(path: Path) -> list[list[Path]]:
     groups = {x: [p for p in _visible_files(x) if p.suffix.lower() == ".csv"] for x in folders}
     for folder, group in groups.items() or [(path, [])]:
         if not group:
-            why = "the folder has no .csv, .skyc, .mcap or log"
+            why = f"the folder has no {', '.join(SUFFIXES[:3])} or log"
             raise _error(folder, why, "Give a folder with one table a vehicle")
         numbers = zip(*(re.findall(r"\d+", p.stem) for p in group), strict=False)
         counts = [[int(x) for x in column] for column in numbers if len({*column}) > 1]
@@ -282,7 +282,7 @@ def _visible_files(folder: Path) -> list[Path]:
 def _may_have_trajectories(path: Path) -> bool:
     """Whether a file may have trajectories, by its name; of one named ``.bin``, by its content."""
     suffix = path.suffix.lower()
-    return suffix in _SUFFIXES or (suffix == ".bin" and _first_bytes_of(path).startswith(logs.BIN))
+    return suffix in SUFFIXES or (suffix == ".bin" and _first_bytes_of(path).startswith(logs.BIN))
 
 
 def _first_bytes_of(path: Path) -> bytes:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity
+from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, display_unit
 from rigidfleet.math import attitude as att
 from rigidfleet.plotting import quadrotors
 from rigidfleet.plotting import style as st
@@ -396,31 +396,22 @@ def constraint_error(result: Result) -> Figure:
 # -- clearance ---------------------------------------------------------------------------------------
 
 
-#: Names of the axes of least distances, and what stands where there is none.
-_PANELS = {
-    "separation": ("between agents [m]", "only one agent"),
-    "separation_below": ("straight below [m]", "no agent is ever straight below another"),
-    "clearance": ("to obstacles [m]", "no obstacles"),
-    "people": ("falls, to people [m]", "no people"),
-}
-
-
 def draw_least(ax: Axes, result: Result, name: str) -> None:
-    """Least distance to others, to one straight below, to obstacles, or of falls to people, with its limit."""
-    label, nothing = _PANELS[name]
-    ax.set_ylabel(label)
+    """Least values, such as distances to others, to obstacles, or of falls to people, with their limit."""
     q, sampled = QUANTITIES[name], samples(result, name)
+    unit = display_unit(q.unit)
+    ax.set_ylabel(f"{q.axis or q.name_in_words} [{unit}]")
     values, limit = getattr(result, name, sampled.worst), q.limit_of(result.mission) or 0.0
     values = np.where(np.isfinite(values), values, np.nan)
     if not np.isfinite(values).any():
         known = {"separation": result.n_agents == 1, "clearance": not result.mission.obstacles}
-        st.mark_empty(ax, nothing if known.get(name, True) else "unknown")
+        st.mark_empty(ax, q.nothing if known.get(name, True) else "unknown")
         if limit:
             ax.set_ylim(0.0, 1.4 * limit)
-            st.draw_limit(ax, limit, f"limit {limit:g} m")
+            st.draw_limit(ax, limit, f"limit {limit:g} {unit}")
         return
     ax.plot(result.time, values, color=st.TONES[0])
-    st.draw_limit(ax, limit, f"limit {limit:g} m" if limit or name == "people" else "contact")
+    st.draw_limit(ax, limit, f"limit {limit:g} {unit}" if limit or name == "people" else "contact")
     if name == "separation":
         _draw_planned_separation(ax, result)
         if (flying := QUANTITIES["separation_flying"].limit_of(result.mission)) is not None:
@@ -435,7 +426,7 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
     look: dict[str, Any] = {"markerfacecolor": "none", "markeredgecolor": st.INK}
     ax.plot(x.time, x.value, "o", markersize=5, clip_on=False, **look)
     who = st.clean_name(owner_name(result, q, x.who, x.other))
-    st.write_above(ax, f"least {x.value:.3g} m at {x.time:.2f} s, {who}")
+    st.write_above(ax, f"least {x.value:.3g} {unit} at {x.time:.2f} s, {who}")
     low, high = min(float(np.nanmin(values)), limit), max(float(np.nanmax(values)), limit)
     room = 0.25 * max(high, -low, 0.1)
     ax.set_ylim(min(low, 0.0) - room, max(high, 0.0) + room)
@@ -478,8 +469,9 @@ def clearance(result: Result) -> Figure:
 
 
 def limited_motions(result: Result) -> list[Quantity]:
-    """Speeds, accelerations and jerks that the mission limits."""
-    return [q for q in MOTIONS if q.limit_of(result.mission) is not None]
+    """What the mission limits of speeds, accelerations, jerks, and what else positions and velocities show."""
+    every = (q for q in QUANTITIES.values() if q in MOTIONS or (q.measure and not q.limit))
+    return [q for q in every if q.limit_of(result.mission) is not None]
 
 
 @st.styled_figure(limited_motions)
@@ -488,6 +480,6 @@ def motion(result: Result) -> Figure:
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]
     fig, axes = st.time_figure(result, "Speed, acceleration and jerk", len(drawn), height=1.8)
     for q, ax in zip(drawn, axes, strict=True):
-        quadrotors.draw_with_limit(ax, result, q.name)
+        (draw_least if q.at_least else quadrotors.draw_with_limit)(ax, result, q.name)
     st.draw_agents_legend(axes[0], result.n_agents)
     return fig

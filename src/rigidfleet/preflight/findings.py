@@ -272,7 +272,7 @@ class Disturbed:
         """Plain data for JSON."""
         return {
             **{f"{name}_n": getattr(self, name) for name in _FORCES},
-            "thrust": _values_by_name("thrust_n time_s who limit_n", self.thrust),
+            "thrust": _worst_value_data("thrust", self.thrust),
             "offset": _values_by_name("offset_m who", self.offset),
             "lost": [_values_by_name("agent time_s", (i + 1, t)) for i, t in self.lost],
         }
@@ -300,9 +300,9 @@ class VehicleCheck:
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
         return {
-            "rotor_force": _values_by_name("force_n time_s who limit_n phase", self.rotor_force),
-            "tilt": _values_by_name("tilt_deg time_s who phase", self.tilt),
-            "jump": _values_by_name("acceleration_m_s2 tilt_deg time_s phase", self.jump),
+            "rotor_force": _worst_value_data("rotor_force", self.rotor_force),
+            "tilt": _values_by_name("tilt time_s who phase", self.tilt),
+            "jump": _values_by_name("acceleration tilt time_s phase", self.jump),
             "beyond": _values_by_name("share who phase needs", self.beyond),
         }
 
@@ -477,7 +477,7 @@ class Preflight(Shown):
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON, agents and slots counted from 1."""
-        proof = "phase separation_m time_s agents how"
+        proof = "phase separation time_s agents how"
         data = {
             "passed": self.passed,
             "remarks": self.remarks,
@@ -499,7 +499,7 @@ class Preflight(Shown):
                     for phase, (least, t, who, how) in self.certificates.items()
                 ],
                 "clearance": [
-                    _values_by_name("obstacle clearance_m time_s who", c) for c in self.clearance
+                    _values_by_name("obstacle clearance time_s who", c) for c in self.clearance
                 ],
                 "gaps": [_values_by_name("between wide_m takes_m time_s", g) for g in self.gaps],
                 "assignments": self.assignments,
@@ -580,10 +580,17 @@ def names_with_verb(names: Sequence[str]) -> str:
 
 
 def _worst_value_data(name: str, worst: Sequence[Any] | None) -> dict[str, Any] | None:
-    """Worst value of a quantity, its time, who has it, and its limit, with units in the keys."""
-    unit = QUANTITIES[name].unit.lower().replace("/", "_").replace("^", "")
-    return _values_by_name(f"{name.rpartition('_')[2]}_{unit} time_s who limit_{unit}", worst)
+    """Worst value of a quantity, its time, who has it, its limit and the phase, with units in the keys."""
+    return _values_by_name(f"{name} time_s who {_key(name, 'limit')} phase", worst)
 
 
 def _values_by_name(spaced_names: str, values: Sequence[Any] | None) -> dict[str, Any] | None:
-    return None if values is None else dict(zip(spaced_names.split(), values, strict=False))
+    """Values by their names; those of quantities get their units."""
+    names = (_key(name) if name in QUANTITIES else name for name in spaced_names.split())
+    return None if values is None else dict(zip(names, values, strict=False))
+
+
+def _key(name: str, what: str = "") -> str:
+    """A value of a quantity in JSON: what it is, by default the last word of its name, and its unit."""
+    unit = QUANTITIES[name].unit.lower().replace("/", "_").replace("^", "")
+    return f"{what or name.rpartition('_')[2]}_{unit}"

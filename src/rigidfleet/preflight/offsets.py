@@ -25,7 +25,7 @@ from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
 from rigidfleet.preflight.margins import phase_gains
 from rigidfleet.preflight.obstacles import obstacle_remarks
-from rigidfleet.preflight.trajectory import downwash_remarks, geofence_remarks, separation_remarks
+from rigidfleet.preflight.trajectory import downwash_remarks, measured_remarks, separation_remarks
 from rigidfleet.preflight.vehicles import STACKED
 from rigidfleet.typing import Floats
 
@@ -143,7 +143,7 @@ def _broken_limits_in_words(
     moved = [replace(planned, position=r, path_ends=None)]
     there = Preflight(mission, preflight.formations, preflight.gains, moved)
     remarks = [*separation_remarks(mission, there), *downwash_remarks(mission, there)]
-    remarks += geofence_remarks(mission, there.planned_phases[0])
+    remarks += measured_remarks(mission, there.planned_phases[0])
     if not phase.lands:  # that ends where vehicles stand
         remarks += obstacle_remarks(mission, there)
     broken = {remark.topic: remark.text for remark in remarks if remark.level == "fails"}

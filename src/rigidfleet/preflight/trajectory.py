@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rigidfleet._common.quantities import QUANTITIES, Quantity
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.formation import distance_geometry
@@ -132,16 +133,31 @@ def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
 
 
 def _worst_value_when_who_limit(
-    way: list[PlannedPhase], values: list[Floats], limits: Floats
+    mission: Mission, q: Quantity, way: list[PlannedPhase], values: list[Floats], limits: Floats
 ) -> tuple[float, float, str, float]:
-    """Of values (K, N) of each phase, the one nearest to its limit (N,), or the greatest if there is none.
+    """Of values (K, N) of each phase, the one nearest to its limit (N,), or the worst if there is none.
 
-    Its value, time [s], agent and limit.
+    Its value, time [s], agent and limit. Vehicles count until they are lost.
     """
-    room = limits if np.isfinite(limits).any() else 0.0
-    planned, x = max(zip(way, values, strict=True), key=lambda pair: (pair[1] - room).max())
-    k, i = np.unravel_index(int((x - room).argmax()), x.shape)
-    return float(x[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])
+    room = q.rank(limits) if np.isfinite(limits).any() else 0.0
+    near = [
+        np.where(planned.time[:, None] <= mission.lost_at, q.rank(x) - room, -np.inf)
+        for planned, x in zip(way, values, strict=True)
+    ]
+    p = int(np.argmax([x.max() for x in near]))
+    k, i = np.unravel_index(int(near[p].argmax()), near[p].shape)
+    return float(values[p][k, i]), float(way[p].time[k]), f"agent {i + 1}", float(limits[i])
+
+
+def _measured_peaks(
+    mission: Mission, way: list[PlannedPhase]
+) -> Iterator[tuple[Quantity, tuple[float, float, str, float]]]:
+    """Of what has a limit and is measured of positions and velocities: what is nearest to it, at samples."""
+    for q in (q for q in QUANTITIES.values() if q.checked and way):
+        if (measure := q.measure) and (limit := q.limit_of(mission)) is not None:
+            values = [measure(mission, x.position, x.velocity) for x in way]
+            limits = np.full(mission.n_agents, limit)
+            yield q, _worst_value_when_who_limit(mission, q, way, values, limits)
 
 
 def find_planned_peaks(mission: Mission, preflight: Preflight) -> None:
@@ -153,9 +169,12 @@ def find_planned_peaks(mission: Mission, preflight: Preflight) -> None:
         if way:
             states = (_planned_states_up_to_order(planned, q.order) for planned in way)
             values = [limit.values(x, np.arange(mission.n_agents)) for x in states]
-            for planned, x in zip(way, values, strict=True):
-                x[planned.time[:, None] > mission.lost_at] = -np.inf
-            preflight.worst[q.name] = _worst_value_when_who_limit(way, values, limit.most)
+            preflight.worst[q.name] = _worst_value_when_who_limit(
+                mission, q, way, values, limit.most
+            )
+    # Of the geofence, only what breaks it is said.
+    peaks = _measured_peaks(mission, preflight.planned_phases)
+    preflight.worst |= {q.name: worst for q, worst in peaks if not q.limit}
 
 
 def _planned_states_up_to_order(planned: PlannedPhase, order: int) -> Floats:
@@ -184,7 +203,8 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
         force = true[:, None] * (planned.acceleration + g * up)
         force -= drag[:, None] * (wind - planned.velocity)
         needs.append(np.linalg.norm(force, axis=2) + gusts + noise)
-    most = _worst_value_when_who_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
+    limits, thrust = mission.fleet.thrust_limit, QUANTITIES["thrust"]
+    most = _worst_value_when_who_limit(thrust, preflight.planned_phases, needs, limits)
     steady = drag_and_lift(mission, np.tile(wind, (len(drag), 1)))
     steady -= ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
@@ -275,7 +295,7 @@ def waypoint_miss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Re
 
 
 def limit_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
-    """Remarks on speed, acceleration and geofence beyond their limits."""
+    """Remarks on speed, acceleration, geofence and what else has a limit beyond it."""
     hopeless: set[str] = set()  # limits that no time keeps; each is told once
     for planned in preflight.planned_phases:
         phase = planned.leg.phase
@@ -292,19 +312,16 @@ def limit_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
                 yield Remark("fails", topic, f"{timing.reached_in_words(over[0], phase)}; {remedy}")
         else:
             yield from _broken_limit_remarks(mission, planned)
-        yield from geofence_remarks(mission, planned)
+        yield from measured_remarks(mission, planned)
 
 
-def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
-    """Remark on an agent that leaves the geofence in a phase."""
-    if (fence := mission.limits.geofence) is not None:
-        low, high = np.array(fence.min), np.array(fence.max)
-        out = np.maximum(low - planned.position, planned.position - high).max(axis=2)
-        k, i = np.unravel_index(int(out.argmax()), out.shape)
-        if out[k, i] > LEEWAY:
-            text = f"agent {i + 1} leaves the geofence by {out[k, i]:.2f} m"
-            text += f" at {planned.time[k]:.2f} s in '{planned.phase}'"
-            yield Remark("fails" if planned.exact else "note", "geofence", text)
+def measured_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
+    """Remarks on what is measured of positions and velocities beyond its limit in a phase; of the geofence, too."""
+    for q, (worst, when, who, limit) in _measured_peaks(mission, [planned]):
+        if q.rank(worst) > q.rank(limit) + LEEWAY:
+            text = q.in_words(f"{worst:.2f} {q.unit}", who, when, limit)
+            level = "fails" if planned.exact else "note"
+            yield Remark(level, q.name_in_words, f"{text} in '{planned.phase}'")
 
 
 def _broken_limit_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:

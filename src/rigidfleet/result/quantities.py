@@ -61,8 +61,9 @@ def owner_name(result: Result, q: Quantity, who: int, other: int = -1) -> str:
 
 
 def mask_lost(result: Result, values: Floats) -> Floats:
-    """Values (K, N), NaN for lost agents."""
-    return values if result.left.all() else np.where(result.left, values, np.nan)
+    """Values (K, N, ...), NaN for lost agents."""
+    left = result.left.reshape(*result.left.shape, *[1] * (values.ndim - 2))
+    return values if left.all() else np.where(left, values, np.nan)
 
 
 def closeness(result: Result) -> proximity.Closeness:
@@ -114,12 +115,11 @@ def _distance_to_lost(result: Result) -> tuple[Floats, Owner]:
     return least, lambda k: who[k]
 
 
-def _distance_beyond_fence(result: Result) -> tuple[Floats, ...]:
-    """Greatest distance (K, N) [m] of an agent's centre outside the geofence; negative inside."""
-    r, fence = result.position, result.mission.limits.geofence
-    if fence is None:
-        return (np.full(result.left.shape, np.nan),)
-    return (mask_lost(result, np.maximum(fence.min - r, r - fence.max).max(axis=2)),)
+def _measures_of_states(result: Result, q: Quantity) -> tuple[Floats, ...]:
+    """Values (K, N) of what positions and velocities show by themselves."""
+    assert q.measure is not None
+    states = (mask_lost(result, x) for x in (result.position, result.velocity))
+    return (q.measure(result.mission, *states),)
 
 
 def _boundary_distances(result: Result, name: str) -> tuple[Any, ...]:
@@ -164,9 +164,8 @@ SAMPLED: dict[str, Callable[[Result], tuple[Any, ...]]] = {
     **{q.name: partial(_motion_magnitudes, q=q) for q in MOTIONS},
     "separation_below": _vertical_separation,
     "lost": _distance_to_lost,
-    "geofence": _distance_beyond_fence,
+    **{q.name: partial(_measures_of_states, q=q) for q in QUANTITIES.values() if q.measure},
     **{name: partial(_boundary_distances, name=name) for name in ("fence", "soft_fence", "people")},
-    **dict.fromkeys(("lowest", "highest"), lambda r: (mask_lost(r, r.position[..., 2]),)),
     "thrust": _thrust,
     "tilt": _tilt,
     "tracking_error": lambda r: (mask_lost(r, norms(r.position - r.slot_position)),),
