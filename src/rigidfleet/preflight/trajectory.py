@@ -132,7 +132,7 @@ def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             yield Remark("fails" if exact else "note", "downwash", text)
 
 
-def _worst_value_when_who_limit(
+def _nearest_to_limit(
     mission: Mission, q: Quantity, way: list[PlannedPhase], values: list[Floats], limits: Floats
 ) -> tuple[float, float, str, float]:
     """Of values (K, N) of each phase, the one nearest to its limit (N,), or the worst if there is none.
@@ -157,7 +157,7 @@ def _measured_peaks(
         if (measure := q.measure) and (limit := q.limit_of(mission)) is not None:
             values = [measure(mission, x.position, x.velocity) for x in way]
             limits = np.full(mission.n_agents, limit)
-            yield q, _worst_value_when_who_limit(mission, q, way, values, limits)
+            yield q, _nearest_to_limit(mission, q, way, values, limits)
 
 
 def find_planned_peaks(mission: Mission, preflight: Preflight) -> None:
@@ -169,9 +169,7 @@ def find_planned_peaks(mission: Mission, preflight: Preflight) -> None:
         if way:
             states = (_planned_states_up_to_order(planned, q.order) for planned in way)
             values = [limit.values(x, np.arange(mission.n_agents)) for x in states]
-            preflight.worst[q.name] = _worst_value_when_who_limit(
-                mission, q, way, values, limit.most
-            )
+            preflight.worst[q.name] = _nearest_to_limit(mission, q, way, values, limit.most)
     # Of the geofence, only what breaks it is said.
     peaks = _measured_peaks(mission, preflight.planned_phases)
     preflight.worst |= {q.name: worst for q, worst in peaks if not q.limit}
@@ -204,7 +202,7 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
         force -= drag[:, None] * (wind - planned.velocity)
         needs.append(np.linalg.norm(force, axis=2) + gusts + noise)
     limits, thrust = mission.fleet.thrust_limit, QUANTITIES["thrust"]
-    most = _worst_value_when_who_limit(thrust, preflight.planned_phases, needs, limits)
+    most = _nearest_to_limit(mission, thrust, preflight.planned_phases, needs, limits)
     steady = drag_and_lift(mission, np.tile(wind, (len(drag), 1)))
     steady -= ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
