@@ -18,16 +18,10 @@ from rigidfleet.typing import Floats, Ints
 #: Slots thinner than this, relative to their length, count as planar or straight. Distances of seven digits
 #: give a flat shape a thickness of 3e-4.
 THIN = 1e-3
-
-
 #: Number of agents up to which all distances of a shape are computed at once.
 _FEW = 16
-
-
 #: Errors of distances that differ by less than this share of the shape's size are equal.
 _ROUNDING = 1e-12
-
-
 #: Greatest number of agents for which a wrong shape is tested for rigidity.
 _JUDGED = 200
 

@@ -167,12 +167,8 @@ def downwash_metric(up: ArrayLike, ratio: float) -> Floats:
 _CACHED = 20_000
 #: Work on assignments, N^3 each, of some seconds.
 _WORK = 2e9
-
-
 #: Greatest number of assignments from one attitude.
 _ROUNDS = 20
-
-
 #: Greatest number of agents for which the least sum of squares of all orders is found.
 _LEAST = 1024
 #: Greatest number of agents for which nobody waits for it.

@@ -13,8 +13,6 @@ from rigidfleet.typing import Floats, Ints
 
 #: Reach of neighbours, in spacings: up to second neighbours on a shell or in a lattice.
 REACH = 1.9
-
-
 #: The 18 edges of the paper's cube (its Table 4 with the swapped pair d45, d48 corrected), counted from 0.
 CUBE_EDGES: Ints = np.array(
     [(0, 1), (0, 3), (0, 4), (0, 5), (1, 2), (1, 3), (1, 5), (1, 6), (2, 3), (2, 6), (2, 7), (3, 4)]
@@ -164,8 +162,6 @@ def _softness_by_triple(p: Floats, some: Ints, at: Ints, soft: Floats) -> Floats
 
 #: Softness beyond which a point lies in a plane with all near points.
 _FLAT = 1e12
-
-
 #: All triples out of twelve.
 _TRIPLES = np.array(list(combinations(range(12), 3)))
 

@@ -148,8 +148,6 @@ class Shape(NamedTuple):
 
 
 _ANY = 1 << 30
-
-
 SHAPES: dict[str, Shape] = {
     "line": Shape(range(1, _ANY), 1, _line, "along x, `size` apart, in the order of the agents"),
     "triangle": Shape(range(3, 4), 1, _triangle, "equilateral; x towards agent 3, y along r1 - r2"),

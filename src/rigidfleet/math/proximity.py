@@ -25,13 +25,9 @@ _SAMPLE = 256
 
 # Number of values that fit into the processor's cache.
 CACHED = 60_000
-
-
 #: Number of points for which a surface of triangles is searched at once, those of each sample together: near ones need
 #: the same triangles.
 _TOGETHER = 2048
-
-
 #: Kinds of solids whose distance takes a search of triangles.
 _SURFACES = HULL, HEIGHTS
 

@@ -64,8 +64,6 @@ _LATER = 1e-6
 _NEAR = 0.1
 #: Difference of two lengths that is ignored [m].
 _ROUNDED = 1e-8
-
-
 #: Residual of an iterative solve, as a share of the integrator's tolerance; the relative residual has bounds.
 _RESIDUAL, _LEAST_RESIDUAL, _MOST_RESIDUAL = 1e-3, 1e-13, 1e-8
 #: Error of an acceleration that is ignored, as a share of the velocity's tolerance per second.

@@ -13,14 +13,8 @@ from rigidfleet.typing import Floats
 
 #: Samples of a planned phase: their number, or the time between them [s], within bounds.
 _SAMPLES = 201
-
-
 _STEP = 0.05
-
-
 _MOST = 2001
-
-
 #: Least number of samples of a phase.
 FEWEST_SAMPLES = 11
 #: Number of agents beyond which a tree finds those near each other (`proximity.separation`).

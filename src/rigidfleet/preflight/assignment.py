@@ -13,8 +13,6 @@ from rigidfleet.preflight.findings import Assignment, Preflight, Remark
 
 #: A shorter assignment is reported if it saves this fraction of the path length and this length besides [m].
 _WORTH, _SHORT = 0.05, 0.1
-
-
 #: Maximum number of agents whose assignments are compared; this takes about a second.
 _COMPARED = 200
 

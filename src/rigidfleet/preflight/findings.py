@@ -39,8 +39,6 @@ from rigidfleet.rigidity import (
 
 #: Maximum number of names in one remark.
 _MOST_NAMES = 6
-
-
 #: Maximum number of equations for which rigidity, and forces at a step, are computed by a dense decomposition.
 DENSE = 600
 #: Number of agents beyond which tracked slots are those of a show, whose edges are not explained.

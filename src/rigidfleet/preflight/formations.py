@@ -37,12 +37,8 @@ _Held = Literal["tracking", "distances", "nothing"]
 _note, _fails = partial(Remark, "note", "formation"), partial(Remark, "fails", "formation")
 #: Maximum number of agents for which other shapes with the same distances are searched by default.
 SEARCHED = 12
-
-
 #: Number of random starts of this search: enough to find common shapes in a tenth of a second.
 STARTS = 40
-
-
 #: A shape is said to be missed if its forecast is off by more tolerances. Near it, forecasts are right to a tenth;
 #: after a step of the reference, which throws the agents, to a factor of 3.
 _SURELY = {"shape": 1.1, "distances": 1.1, "squares": 1.1, "step": 3.0}

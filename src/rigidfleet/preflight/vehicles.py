@@ -27,8 +27,6 @@ from rigidfleet.typing import Floats
 
 #: Greatest number of samples times agents, and of agents of which all pairs are looked at for jets.
 _PLACES, STACKED = 200_000, 60
-
-
 #: Samples of a phase, and the time between them [s], within bounds: where derivatives of the reference are evaluated.
 _SAMPLES, _STEP, _MOST = 201, 0.02, 2001
 #: Jump of the acceleration that is told [m/s^2].

@@ -73,8 +73,6 @@ ATTRIBUTES: dict[str, Any] = {
 }
 #: Attribute that identifies a file as a result.
 _MARK = "rigidfleet_schema_version"
-
-
 #: Maximum size of a chunk [bytes]: the size of HDF5's cache.
 _CHUNK = 1 << 20
 

@@ -43,8 +43,6 @@ from rigidfleet.typing import Floats
 
 #: Greatest number of ticks in a table, and of steps between two returns to Python.
 _TICKS, _STEPS = 1024, 4000
-
-
 #: Time for which vehicles with clocks of their own fly before the plan's events are put off [s].
 _STRETCH = 0.1
 #: Pace of a clock below which it waits.
