@@ -6,6 +6,7 @@ import logging
 import math
 import os
 import random
+import re
 import shutil
 import signal
 import sqlite3
@@ -793,6 +794,41 @@ def test_an_executor_that_dies_is_a_sentence(flown, tmp_path, monkeypatch, capsy
     with Dying(1) as pool, pytest.raises(RigidfleetError):
         fly(asked, tmp_path / "again", pool=pool, workers=1)
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        MemoryError("no room"),
+        OSError("no library"),
+        RuntimeError("can't start new thread"),
+        RigidfleetError("RIGIDFLEET_LEVEL: no"),
+    ],
+)
+def test_a_fault_of_the_machine_is_no_row(flown, fault, tmp_path, monkeypatch):
+    """It ends the chunk, in this process and in a worker, in flight and in the verdict; elsewhere the sweep goes on."""
+
+    def fail(*_: Any) -> Any:
+        raise fault
+
+    for place in ("simulation.together.simulate_together", "assessment.assess"):
+        with monkeypatch.context() as short, ThreadPoolExecutor(1) as pool:
+            short.setattr(f"rigidfleet.{place}", fail)
+            with pytest.raises(RigidfleetError, match=re.escape(str(fault))):
+                fly(sweep(), tmp_path, workers=1)
+            words = rf"a worker failed: .*{fault}\. .*: 0 of 20 runs are saved; the same command"
+            with pytest.raises(RigidfleetError, match=words):
+                fly(sweep(), tmp_path, pool=pool, workers=1)
+    assert not len(read(tmp_path).run)
+    assert numbers(fly(sweep(), tmp_path, workers=1)) == numbers(flown)
+
+
+def test_a_worker_that_cannot_run_the_level_says_so(tmp_path, monkeypatch):
+    """A worker's machine is asked before it flies, so that no row is false."""
+    monkeypatch.setenv("RIGIDFLEET_LEVEL", "x86-64-v9")
+    words = r"a worker failed: RIGIDFLEET_LEVEL: this machine cannot run 'x86-64-v9'.*0 of 20 runs"
+    with ThreadPoolExecutor(1) as pool, pytest.raises(RigidfleetError, match=words):
+        fly(sweep(), tmp_path, pool=pool, workers=1)
 
 
 def test_a_pool_that_breaks_as_it_is_given_work_loses_none(tmp_path, monkeypatch, caplog):
@@ -1709,7 +1745,7 @@ def test_a_worker_with_another_controller_is_refused(folder):
 
     Path("c_law.py").write_text(LAW)
     found = Sweep.of(MISSION, SCATTER, runs=2, controller="c_law:follow")
-    with pytest.raises(RigidfleetError, match=r"a worker has rigidfleet .* with c_law:follow"):
+    with pytest.raises(RigidfleetError, match=r"it has rigidfleet .* with c_law:follow"):
         fly_chunk(found.json(), found.version.replace("c_law:follow ", "c_law:follow x"), [0])
 
 

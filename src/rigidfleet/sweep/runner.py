@@ -98,8 +98,9 @@ def fly(
     ResultError
         The folder contains another sweep or cannot be written.
     RigidfleetError
-        The cluster does not answer or ends, workers keep dying, the controller cannot be imported, or there is no such
-        shard. Finished runs are in the store, and the same call resumes the sweep.
+        The cluster does not answer or ends, a worker cannot fly, workers keep dying, the
+        controller cannot be imported, or there is no such shard. Finished runs are in the store, and the same call
+        resumes the sweep.
     KeyboardInterrupt
         On Ctrl-C. Finished runs are in the store, and the same call resumes the sweep.
     """
@@ -150,11 +151,23 @@ class _Sweeping:
         self.report_progress(1)
 
     def fly_in_this_process(self, *, until_worth: bool) -> None:
-        """Fly in this process: all runs, or until the remaining work justifies more processes."""
+        """Fly in this process: all runs, or until the remaining work justifies more processes.
+
+        Raises
+        ------
+        RigidfleetError
+            This machine cannot fly them.
+        """
         while self.missing:
             if until_worth and self.pace * GROUP * len(self.missing) > WORTH:
                 return
-            self.store_records(fly_runs(self.sweep, self.take_chunk(1)))
+            try:
+                rows = fly_runs(self.sweep, self.take_chunk(1))
+            except RigidfleetError as error:
+                if error.__cause__ is None:  # nothing that was saved helps
+                    raise
+                raise self.failure(pools.why_failed(error, "this process failed")) from error
+            self.store_records(rows)
             self.report_progress(1)
 
     def fly_by_executor(self, executor: Executor, capacity: Callable[[], int]) -> None:
@@ -169,10 +182,8 @@ class _Sweeping:
         def call_or_fail(call: Callable[..., Any], *arguments: Any) -> Any:
             try:
                 return call(*arguments)
-            except RigidfleetError:
-                raise
             except Exception as error:
-                raise self.failure(pools.why_failed(error)) from error
+                raise self.failure(pools.why_failed(error, "a worker failed")) from error
 
         flying: dict[Future[list[RunRecord]], list[int]] = {}
         taken: list[int] = []
