@@ -831,6 +831,26 @@ def test_a_worker_that_cannot_run_the_level_says_so(tmp_path, monkeypatch):
         fly(sweep(), tmp_path, pool=pool, workers=1)
 
 
+@pytest.mark.parametrize(
+    ("keys", "error", "words"),
+    [
+        ({"workers": 0}, TypeError, "a whole number of workers, 1 or more, got 0"),
+        ({"workers": -2}, TypeError, "got -2"),
+        ({"workers": 1.5}, TypeError, "got 1.5"),
+        ({"workers": "2"}, TypeError, "got '2'"),
+        ({"pool": 0, "workers": 0}, TypeError, "got 0"),
+        ({"pool": 0, "cluster": "tcp://127.0.0.1:9"}, RigidfleetError, "exclude each other"),
+        ({"pool": 0}, RigidfleetError, "takes no work: RuntimeError: .* after shutdown.* 0 of 20"),
+    ],
+)
+def test_workers_that_cannot_be_are_one_error(keys, error, words, tmp_path):
+    """Numbers of workers that are none, an executor beside a cluster, and one that is shut down."""
+    pool = ThreadPoolExecutor(1)
+    pool.shutdown()
+    with pytest.raises(error, match=words):
+        fly(sweep(), tmp_path, **keys | ({"pool": pool} if "pool" in keys else {}))
+
+
 def test_a_pool_that_breaks_as_it_is_given_work_loses_none(tmp_path, monkeypatch, caplog):
     """The chunk that a broken pool does not take is flown by the next one; the log says what progress says."""
     from contextlib import contextmanager

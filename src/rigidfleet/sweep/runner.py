@@ -98,14 +98,20 @@ def fly(
     ResultError
         The folder contains another sweep or cannot be written.
     RigidfleetError
-        The cluster does not answer or ends, a worker cannot fly, workers keep dying, the
+        The cluster does not answer or ends, a worker cannot fly, workers keep dying, the executor takes no work, the
         controller cannot be imported, or there is no such shard. Finished runs are in the store, and the same call
-        resumes the sweep.
+        resumes the sweep. Or there are both ``pool`` and ``cluster``.
+    TypeError
+        ``pool`` is no executor, or ``workers`` no number of workers.
     KeyboardInterrupt
         On Ctrl-C. Finished runs are in the store, and the same call resumes the sweep.
     """
     if not isinstance(pool, Executor | None):
         raise wrong_type("an Executor of concurrent.futures as pool", pool)
+    if workers is not None and (not isinstance(workers, int) or workers < 1):
+        raise wrong_type("a whole number of workers, 1 or more", workers)
+    if pool is not None and cluster is not None:
+        raise RigidfleetError("pool and cluster exclude each other: use one of them.")
     own, folder = runs_of_shard(shard, sweep.runs), shard_folder(Path(folder), shard)
     if not own.any():
         words = f"{sweep.runs} runs, in groups of {GROUP}, are enough for K/N with N up to {-(-sweep.runs // GROUP)}"
@@ -183,7 +189,8 @@ class _Sweeping:
             try:
                 return call(*arguments)
             except Exception as error:
-                raise self.failure(pools.why_failed(error, "a worker failed")) from error
+                who = "the executor takes no work" if call == executor.submit else "a worker failed"
+                raise self.failure(pools.why_failed(error, who)) from error
 
         flying: dict[Future[list[RunRecord]], list[int]] = {}
         taken: list[int] = []
