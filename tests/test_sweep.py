@@ -466,6 +466,29 @@ def test_what_is_no_store(tmp_path):
     assert (tmp_path / "sweep.db").read_bytes().startswith(b"not a database")
 
 
+def test_a_store_without_its_table_is_as_absent(tmp_path):
+    """A file of a store that was killed as it began, empty or with a head alone, is no sweep; the same call fills it."""
+    for name in ("empty", "shards/2-of-2"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "sweep.db").touch()
+    (tmp_path / "head").mkdir()
+    with closing(sqlite3.connect(tmp_path / "head" / "sweep.db")) as db:
+        db.execute("PRAGMA journal_mode = WAL")
+        db.execute("PRAGMA user_version = 1")
+    assert (tmp_path / "head" / "sweep.db").stat().st_size
+    for name in ("empty", "head"):
+        with pytest.raises(ResultError, match=f"{name}: contains no sweep"):
+            read(tmp_path / name)
+        assert fly(sweep(runs=3), tmp_path / name, workers=1).complete
+    with pytest.raises(ResultError, match="shards: contains no sweep"):
+        merge(tmp_path)
+    parts(tmp_path, "1/2")
+    with pytest.raises(ResultError, match="missing or partly flown: 2\\. Fly"):
+        merge(tmp_path)
+    parts(tmp_path, "2/2")
+    assert merge(tmp_path).complete
+
+
 def test_a_group_is_never_split():
     """Chunks are whole groups of eight consecutive runs, whatever is missing."""
     from rigidfleet.sweep.runner import _Sweeping

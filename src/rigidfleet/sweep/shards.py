@@ -10,7 +10,15 @@ import numpy as np
 
 from rigidfleet.errors import ResultError, RigidfleetError
 from rigidfleet.sweep.run import GROUP
-from rigidfleet.sweep.store import FILE, Store, Table, diff_names, outcome_of, read, store_contents
+from rigidfleet.sweep.store import (
+    Store,
+    Table,
+    diff_names,
+    is_store,
+    outcome_of,
+    read,
+    store_contents,
+)
 from rigidfleet.typing import Bools, Ints
 
 #: Folder of the shards in the folder of their sweep.
@@ -39,7 +47,7 @@ def shard_folder(folder: Path, shard: str) -> Path:
 
 def shard_folders(folder: Path) -> list[Path]:
     """Folders of the shards that are in the folder of a sweep."""
-    return sorted(path.parent for path in folder.glob(f"{_SHARDS}/*/{FILE}"))
+    return sorted(path for path in folder.glob(f"{_SHARDS}/*") if is_store(path))
 
 
 def merge(folder: str | Path, *, replace: bool = False) -> Table:

@@ -172,8 +172,21 @@ def _column_names(db: sqlite3.Connection) -> set[str]:
 
 
 def is_store(folder: Path) -> bool:
-    """Whether a folder contains a sweep."""
-    return (folder / FILE).is_file()
+    """Whether a folder contains a sweep: the file of one that was killed as it began has no table yet.
+
+    Raises
+    ------
+    ResultError
+        The file is damaged or cannot be read.
+    """
+    if not (path := folder / FILE).is_file():
+        return False
+    with _as_result_errors(path), closing(sqlite3.connect(path)) as db:
+        return _has_tables(db)
+
+
+def _has_tables(db: sqlite3.Connection) -> bool:
+    return db.execute("SELECT 1 FROM sqlite_master WHERE name = 'sweep'").fetchone() is not None
 
 
 def read(folder: str | Path) -> Table:
@@ -210,7 +223,7 @@ def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any,
         The folder does not contain a sweep.
     """
     path = folder / FILE
-    if not path.is_file():
+    if not is_store(folder):
         raise ResultError(f"{folder}: contains no sweep. `rigidfleet sweep` creates one.")
     with _as_result_errors(path), closing(sqlite3.connect(path)) as db:
         _check_format(db, folder)
@@ -226,7 +239,7 @@ def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any,
 
 def _check_format(db: sqlite3.Connection, folder: Path) -> None:
     """Raise ResultError if a store has another format."""
-    if db.execute("SELECT 1 FROM sqlite_master WHERE name = 'sweep'").fetchone() is None:
+    if not _has_tables(db):
         return  # a new file
     made = max(1, db.execute("PRAGMA user_version").fetchone()[0])
     older = "Fly the sweep again: use --force to overwrite, or --out to choose another folder"
