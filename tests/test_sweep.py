@@ -1831,6 +1831,33 @@ def test_a_full_disk_is_named_and_the_sweep_goes_on(flown, tmp_path, monkeypatch
     assert numbers(fly(sweep(), tmp_path, workers=1)) == numbers(flown)
 
 
+@pytest.mark.parametrize("shard", [[], ["--shard", "2/2"]])
+def test_a_sweep_that_was_stopped_before_its_first_run_goes_on_by_its_definition(
+    folder, capsys, monkeypatch, shard
+):
+    """Where the disk is full at the start, the folder has a lock and perhaps an empty file: it says how to go on."""
+    from rigidfleet.sweep.store import Store
+
+    def full(self: Store, asked: Sweep) -> None:
+        raise sqlite3.OperationalError("database or disk is full")
+
+    line = ["sweep", "pair.toml", "--vary", SCATTER[1], "--runs", "20", "--quiet", *shard]
+    with monkeypatch.context() as no_room:
+        no_room.setattr(Store, "_open_database", full)
+        assert cli.main(line) == codes.BAD_INPUT
+    assert "the disk is full" in capsys.readouterr().err
+    again = ["sweep", "sweeps/pair", *shard]
+    for file in Path("sweeps").rglob("sweep.db"):
+        assert not file.stat().st_size
+        assert cli.main(again) == codes.BAD_INPUT
+        assert "Go on by the command that defines it" in capsys.readouterr().err
+        file.unlink()
+    assert cli.main(again) == codes.BAD_INPUT
+    err = capsys.readouterr().err
+    assert "sweeps/pair: the sweep in it was stopped before its first run. Go on by" in err
+    assert cli.main(line) == codes.PASSED
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is sent as a signal")
 @pytest.mark.parametrize("verb", ["run", "sweep", "check", "missions"])
 def test_ctrl_c_while_loading_is_quiet(tmp_path, verb):

@@ -216,6 +216,11 @@ def _sweep_and_folder(
         definition.runs = definition.runs if runs is None else runs
         return definition, here
     named = what in mission_names()
+    if not named and (shards.shard_folder(here, shard) / store.LOCK).exists():
+        words = (
+            "the sweep in it was stopped before its first run. Go on by the command that defines it"
+        )
+        raise RigidfleetError(f"{what}: {words}, by its mission and --vary.")
     others = keys["drill"] is not None and not named and here.suffix != ".toml" and here.exists()
     if of_others and not others and (named or here.exists()):
         raise RigidfleetError(

@@ -31,7 +31,7 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 FILE = "sweep.db"
 #: Locked by the process that writes. The lock ends with the process, even if that is killed.
-_LOCK = "sweep.lock"
+LOCK = "sweep.lock"
 #: Version of the format, stored as `user_version`; 0 in files of the first format.
 _FORMAT = 3
 #: Space on a disk that SQLite needs to work, and reports as errors of all kinds if it has less [bytes].
@@ -89,7 +89,7 @@ class Store:
         self.path, self.shard = folder / FILE, shard
         with _as_result_errors(self.path), ExitStack() as opened:
             folder.mkdir(parents=True, exist_ok=True)
-            lock = sqlite3.connect(folder / _LOCK, timeout=0.0, isolation_level=None)
+            lock = sqlite3.connect(folder / LOCK, timeout=0.0, isolation_level=None)
             opened.enter_context(closing(lock)).execute("BEGIN EXCLUSIVE")
             if replace:
                 for end in ("-wal", "-shm", "-journal", ""):
