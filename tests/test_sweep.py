@@ -704,7 +704,7 @@ def test_a_shard_that_is_missing_or_partly_flown_is_named(tmp_path):
         merge(tmp_path)
     words = str(caught.value)
     assert "of 3 shards, these are missing or partly flown: 1 (has 8 of 24 runs), 3." in words
-    assert f"`rigidfleet sweep {tmp_path} --shard 1/3`" in words
+    assert f"`rigidfleet sweep {tmp_path} --shard 1/3 --runs 60`" in words
     assert not (tmp_path / "sweep.db").exists()
     seen: list[SweepProgress] = []
     fly(asked, tmp_path, workers=1, shard="1/3", progress=seen.append)
@@ -719,12 +719,11 @@ def change(folder: Path, words: str) -> None:
 
 
 def test_shards_that_do_not_fit_are_refused(tmp_path, monkeypatch):
-    """What differs is named: seed, runs, number of shards, mission, version."""
+    """What differs is named: seed, number of shards, mission, version."""
     odd = Mission.from_dict(PAIR | {"output_step": 0.05})
     for k, (shard, asked, words) in enumerate(
         (
             ("2/2", sweep(seed=4), "seed"),
-            ("2/2", sweep(runs=19), "number of runs"),
             ("2/3", sweep(), "number of shards"),
             ("2/2", sweep(mission=odd), "mission"),
             ("2/2", sweep(), "version"),
@@ -1441,6 +1440,29 @@ def test_the_command_flies_shards(folder, capsys):
     assert json.loads(capsys.readouterr().out)["success"]["of"] == 20
     assert numbers(read("sweeps/pair")) == numbers(whole)
     assert Path("sweeps/pair/figures/outcome.png").exists()
+
+
+@pytest.mark.parametrize("grown", [[1, 2, 4], [1]])
+def test_the_repair_that_merging_names_makes_one_sweep(folder, capsys, grown):
+    """A shorter sweep lies in the folder, or shorter shards: what merging names is flown, one after the other."""
+    line = ["sweep", "pair.toml", "--vary", SCATTER[0], "--seed", "3", "--quiet", "--runs"]
+    assert cli.main([*line, "12"]) == codes.PASSED
+    for k in (1, 2, 4):
+        with pytest.warns(UserWarning) if k == 4 and k not in grown else nullcontext():
+            runs = "61" if k in grown else "12"
+            assert cli.main([*line, runs, "--shard", f"{k}/4"]) == codes.PASSED
+    repairs = []
+    while cli.main(["sweep", "sweeps/pair", "--merge", "--quiet"]):
+        named = re.search("`rigidfleet ([^`]*)`", capsys.readouterr().err)
+        assert named is not None
+        repairs.append(named[1])
+        assert cli.main([*named[1].split(), "--quiet"]) == codes.PASSED
+    missing = [k for k in range(1, 5) if k not in grown]
+    assert repairs == [f"sweep sweeps/pair --shard {k}/4 --runs 61" for k in missing]
+    whole = fly(sweep(SCATTER[0], runs=61), folder / "whole", workers=1)
+    assert numbers(read("sweeps/pair")) == numbers(whole)
+    assert cli.main(["sweep", "sweeps/pair", "--shard", "2/4", "--quiet"]) == codes.PASSED
+    assert read("sweeps/pair/shards/2-of-4").sweep.runs == 61
 
 
 def test_progress_words():

@@ -206,13 +206,13 @@ def _sweep_and_folder(
     from rigidfleet.sweep.definition import is_sweep_file
 
     here = Path(what)
-    if stored := [here] * store.is_store(here) or (shards.shard_folders(here) if shard else []):
+    if stored := (shards.shard_folders(here) if shard else []) or [here] * store.is_store(here):
         if vary or out is not None or of_others or any(x is not None for x in keys.values()):
             raise RigidfleetError(
                 f"{what}: is the folder of a sweep, whose definition cannot change. Remove all options that define one:"
                 " only --runs may grow."
             )
-        definition = store.read(stored[0]).sweep
+        definition = max((store.read(x).sweep for x in stored), key=lambda sweep: sweep.runs)
         definition.runs = definition.runs if runs is None else runs
         return definition, here
     named = what in mission_names()

@@ -55,7 +55,8 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
 
     Parameters
     ----------
-    folder : shards are all stores in folders of its folder `shards`, whatever their names
+    folder : shards are all stores in folders of its folder `shards`, whatever their names; the sweep has as many runs
+        as the longest of them
     replace : overwrite another sweep that is in the folder
 
     Raises
@@ -67,7 +68,7 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
     folder = Path(folder)
     paths = shard_folders(folder) or [folder / _SHARDS]
     stored = [store_contents(path) for path in paths]
-    sweep, common, _ = stored[0]
+    (_, common, _), sweep = stored[0], max((own for own, *_ in stored), key=lambda x: x.runs)
     rows: dict[int, tuple[Path, tuple[Any, ...]]] = {}
     for path, (_, own, part) in zip(paths, stored, strict=True):
         if own != common:
@@ -85,7 +86,7 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
         ]
         raise ResultError(
             f"{folder}: of {count} shards, these are missing or partly flown: {', '.join(words)}. Fly each, as by"
-            f" `rigidfleet sweep {folder} --shard {lacking[0]}/{count}`, and merge again."
+            f" `rigidfleet sweep {folder} --shard {lacking[0]}/{count} --runs {sweep.runs}`, and merge again."
         )
     with Store(folder, sweep, "", replace) as store:
         store.insert_rows(row for _, row in rows.values())

@@ -230,7 +230,7 @@ def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any,
         entries = dict(db.execute("SELECT key, value FROM sweep"))
         sweep = Sweep.from_json(entries["sweep"])
         shards = int(entries.get("shard", "").partition("/")[2] or 1)
-        common = {"number of runs": sweep.runs, "number of shards": shards}
+        common = {"number of shards": shards}
         known = _column_names(db)
         names = ", ".join(f'"{name}"' if name in known else "NULL" for name in _COLUMNS)
         rows = db.execute(f"SELECT {names} FROM runs ORDER BY run").fetchall()
