@@ -313,7 +313,12 @@ FOUND = "narrow-passage-found"  # searches its way through a gap
 
 @pytest.mark.parametrize(
     ("line", "searches"),
-    [("constraint.alpha = grid(0.4, 0.6)", 1), ("obstacles.3.min.1 += grid(0, 0.4)", 2)],
+    [
+        ("constraint.alpha = grid(0.4, 0.6)", 1),
+        ("tracking.Q.1 = grid(3, 9)", 1),
+        ("agents.mass.1 = grid(1, 1.2)", 2),
+        ("obstacles.3.min.1 += grid(0, 0.4)", 2),
+    ],
 )
 def test_a_way_is_searched_once_where_nothing_that_varies_matters_to_it(
     monkeypatch, line, searches
@@ -346,10 +351,16 @@ def test_what_matters_in_flight_alone_changes_no_way():
     noise = {"position": 0.02, "velocity": 0.05, "rate": 20.0, "seed": 3}
     gusts = {"model": "dryden", "altitude": 20.0, "correlation_length": 20.0, "seed": 1}
     air = {"wind": [3.0, 1.0, 0.0], "drag": 0.4, "mass_error": 0.1, "gusts": gusts, "noise": noise}
-    other = {"integrator": {"rtol": 1e-5}, "constraint": {"alpha": 0.6}, "disturbances": air}
+    other = {
+        "integrator": {"rtol": 1e-5},
+        "constraint": {"alpha": 0.6},
+        "tracking": {"Q": [9.0, 5.0]},
+        "disturbances": air,
+    }
     for keys in [
         ("integrator", "rtol"),
         ("constraint", "alpha"),
+        ("tracking", "Q", 0),
         *(("disturbances", k) for k in air),
     ]:
         assert not can_affect_plan(written, keys)
@@ -362,7 +373,7 @@ def test_what_matters_in_flight_alone_changes_no_way():
         "agents.position.1",
         "agents.mass",
         "obstacles.2",
-        "tracking.Q",
+        "lqr.S",
         "disturbances.lost",
     ):
         assert can_affect_plan(written, tuple(path.split(".")))
@@ -370,6 +381,28 @@ def test_what_matters_in_flight_alone_changes_no_way():
     del settling[0]["until"]
     assert can_affect_plan(Mission.from_dict(PAIR | {"phases": settling}), ("constraint", "alpha"))
     assert can_affect_plan(load_mission("passage-quadrotors"), ("constraint", "alpha"))
+
+
+def test_tracking_matters_where_a_body_arrives_before_its_phase_ends():
+    """It then comes to rest by tracking, and only from rest a way begins: slow gains leave it in motion."""
+    tables = load_mission(FOUND).to_dict()
+    tables["phases"][-3]["travel"] = 6.0
+    tables["lqr"]["S"] = [1e3, 0.0]  # the velocity on arrival is free
+    written = Mission.from_dict(tables | {"tracking": {"Q": [40.0, 40.0]}})
+    assert can_affect_plan(written, ("tracking", "Q"))
+    assert len(expand_mission(written).phases) > len(written.phases)
+    with pytest.raises(MissionError, match="a way begins at rest"):
+        expand_mission(Mission.from_dict(tables | {"tracking": {"Q": [0.1, 0.1]}}))
+
+
+def test_air_and_noise_move_ways_to_own_places():
+    """Ways home keep room for what drag does, which tracking answers to; only tolerances leave them."""
+    tables = load_mission("change-of-picture").to_dict()
+    tables["phases"][-1]["places"] = "own"
+    home = Mission.from_dict(tables)
+    for path in ("disturbances.wind", "disturbances.noise", "tracking.Q", "constraint.alpha"):
+        assert can_affect_plan(home, tuple(path.split(".")))
+    assert not can_affect_plan(home, ("integrator", "rtol"))
 
 
 def test_a_sweep_without_a_way_says_so_in_each_row():
