@@ -233,6 +233,8 @@ def _sweep_and_folder(
         definition = Sweep.of(mission, vary, runs=runs, origin="rigidfleet sweep", **keys)
     elif not named and is_sweep_file(what):
         definition = Sweep.load(what, more=vary, runs=runs, **keys)
+        for file, note in definition.drill.notes_on_files() if definition.drill else ():
+            console.warn(f"{file}: {note}.")
     else:
         definition = Sweep.of(what, vary, runs=runs, origin="rigidfleet sweep", **keys)
     return definition, out or Path("sweeps", definition.name)
