@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 #: Number of consecutive runs in a group. The first run of a group is a multiple of it.
 GROUP = 8
-#: What Python says where a process may have no more threads.
-_NO_THREAD = "can't start new thread"
 
 
 def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
@@ -125,7 +123,7 @@ def _value_or_error(job: Callable[[], Any]) -> Any:
         before = error.__context__ or error.__cause__
         if isinstance(before, KeyboardInterrupt) or type(error) is RigidfleetError:
             raise  # Ctrl-C, turned into another exception by the compiler; or a sentence that names the machine's fault
-        out = (isinstance(x, MemoryError) or str(x) == _NO_THREAD for x in (error, before))
+        out = (isinstance(x, MemoryError) or "start new thread" in str(x) for x in (error, before))
         if isinstance(error, OSError) or any(out):
             raise RigidfleetError(f"{type(error).__name__}: {error}") from error
         return error

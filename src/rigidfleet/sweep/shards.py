@@ -10,15 +10,7 @@ import numpy as np
 
 from rigidfleet.errors import ResultError, RigidfleetError
 from rigidfleet.sweep.run import GROUP
-from rigidfleet.sweep.store import (
-    Store,
-    Table,
-    diff_names,
-    is_store,
-    outcome_of,
-    read,
-    store_contents,
-)
+from rigidfleet.sweep.store import Store, Table, diff_names, is_store, outcome, read, store_contents
 from rigidfleet.typing import Bools, Ints
 
 #: Folder of the shards in the folder of their sweep.
@@ -76,7 +68,7 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
             raise ResultError(f"{path}: does not fit {paths[0]}; it differs in: {other}. {_MOVE}")
         for row in part:
             where, same = rows.setdefault(row[0], (path, row))
-            if outcome_of(row) != outcome_of(same):
+            if outcome(row) != outcome(same):
                 raise ResultError(f"{path}: run {row[0]} is not as in {where}. {_MOVE}")
     shards = _shard_of_runs(sweep.runs, count := common["number of shards"])
     total, flown = (np.bincount(x, minlength=count + 1) for x in (shards, shards[[*rows]]))

@@ -39,7 +39,7 @@ _ROOM = 1 << 20
 _COLUMNS = ("run", "passed", "reason", "detail", "wall", "level", "codes", *METRICS)
 _KINDS = {"passed": "INTEGER", "reason": "TEXT", "detail": "TEXT", "level": "TEXT", "codes": "BLOB"}
 #: Of a row in the order of the columns: what depends on the sweep alone, not on who flew it.
-outcome_of = itemgetter(*(k for k, x in enumerate(_COLUMNS) if x not in ("wall", "level")))
+outcome = itemgetter(*(k for k, x in enumerate(_COLUMNS) if x not in ("wall", "level")))
 #: Little-endian, so that the file can be read on every machine.
 _CODES = np.dtype("<f8")
 
@@ -167,7 +167,7 @@ class Store:
 
 
 def _column_names(db: sqlite3.Connection) -> set[str]:
-    """Columns of a store: one that an earlier version wrote may lack metrics."""
+    """Columns of a store: none of a new file; one that an earlier version wrote may lack metrics."""
     return {name for _, name, *_ in db.execute("PRAGMA table_info(runs)")}
 
 
@@ -182,11 +182,7 @@ def is_store(folder: Path) -> bool:
     if not (path := folder / FILE).is_file():
         return False
     with _as_result_errors(path), closing(sqlite3.connect(path)) as db:
-        return _has_tables(db)
-
-
-def _has_tables(db: sqlite3.Connection) -> bool:
-    return db.execute("SELECT 1 FROM sqlite_master WHERE name = 'sweep'").fetchone() is not None
+        return bool(_column_names(db))
 
 
 def read(folder: str | Path) -> Table:
@@ -198,20 +194,15 @@ def read(folder: str | Path) -> Table:
         The folder does not contain a sweep.
     """
     sweep, _, rows = store_contents(Path(folder))
-    run, passed, reason, detail, wall, level, codes, *metrics = list(zip(*rows, strict=True)) or [
-        () for _ in _COLUMNS
-    ]
+    columns = list(zip(*rows, strict=True)) or [()] * len(_COLUMNS)
+    run, passed, reason, detail, wall, level, codes, *metrics = columns
     return Table(
-        sweep,
-        np.array(run, dtype=np.int64),
-        np.array(passed, dtype=bool),
-        np.array(reason, dtype=object),
+        sweep, np.array(run, dtype=np.int64), np.array(passed, dtype=bool), np.array(reason, dtype=object),
         np.array(detail, dtype=object),
         np.frombuffer(b"".join(codes), dtype=_CODES).reshape(len(run), len(sweep.columns)),
         {name: np.array(x, dtype=np.float64) for name, x in zip(METRICS, metrics, strict=True)},
-        np.array(wall, dtype=np.float64),
-        dict(Counter(filter(None, level))),
-    )
+        np.array(wall, dtype=np.float64), dict(Counter(filter(None, level))),
+    )  # fmt: skip
 
 
 def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any, ...]]]:
@@ -229,8 +220,7 @@ def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any,
         _check_format(db, folder)
         entries = dict(db.execute("SELECT key, value FROM sweep"))
         sweep = Sweep.from_json(entries["sweep"])
-        shards = int(entries.get("shard", "").partition("/")[2] or 1)
-        common = {"number of shards": shards}
+        common = {"number of shards": int(entries.get("shard", "").partition("/")[2] or 1)}
         known = _column_names(db)
         names = ", ".join(f'"{name}"' if name in known else "NULL" for name in _COLUMNS)
         rows = db.execute(f"SELECT {names} FROM runs ORDER BY run").fetchall()
@@ -239,7 +229,7 @@ def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any,
 
 def _check_format(db: sqlite3.Connection, folder: Path) -> None:
     """Raise ResultError if a store has another format."""
-    if not _has_tables(db):
+    if not _column_names(db):
         return  # a new file
     made = max(1, db.execute("PRAGMA user_version").fetchone()[0])
     older = "Fly the sweep again: use --force to overwrite, or --out to choose another folder"

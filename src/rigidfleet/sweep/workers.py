@@ -35,9 +35,8 @@ def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
     """
     flown = sweep_of_json(sweep)
     if version != flown.version:
-        raise RigidfleetError(
-            f"it has {flown.version}, but the sweep was started by {version}. Install the same version on all machines."
-        )
+        words = "Install the same version on all machines"
+        raise RigidfleetError(f"it has {flown.version}, and the sweep {version}. {words}.")
     runnable_instruction_level()
     return fly_runs(flown, runs)
 
