@@ -403,6 +403,10 @@ def test_air_and_noise_move_ways_to_own_places():
     for path in ("disturbances.wind", "disturbances.noise", "tracking.Q", "constraint.alpha"):
         assert can_affect_plan(home, tuple(path.split(".")))
     assert not can_affect_plan(home, ("integrator", "rtol"))
+    assert len(expand_mission(home).phases) > len(home.phases)
+    air = {"drag": 0.3, "wind": [6.0, 0.0, 0.0]}
+    with pytest.raises(MissionError, match="straight to their own"):
+        expand_mission(Mission.from_dict(tables | {"disturbances": air}))
 
 
 def test_a_sweep_without_a_way_says_so_in_each_row():
