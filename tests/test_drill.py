@@ -439,6 +439,26 @@ def test_stale_files_are_flown(tmp_path):
     assert drilled.measure_fault(GeometricFault("stale", 2.0, np.array([5]), stream))[1] == ""
 
 
+def test_the_command_tells_notes_on_files_of_a_sweep_file_once(tmp_path, capsys, monkeypatch):
+    """What a file leaves open is told of files and earlier versions, with their names; missions have no notes."""
+    monkeypatch.chdir(tmp_path)
+    rows = [f"{t},{who},{x},0,{t + 1}" for who, x in (("a", 0), ("b", 5)) for t in range(3)]
+    for name in ("now.csv", "before.csv"):
+        Path(name).write_text("\n".join(["time,agent,x,y,z", *rows]) + "\n")
+    drill = 'mission = "two-agents"\nruns = 3\n[drill]\n'
+    Path("drill.toml").write_text(
+        drill + 'files = ["now.csv"]\nstale = ["before.csv", "two-agents"]\n'
+    )
+    assert main(["sweep", "drill.toml", "--no-figures", "--quiet"]) == 0
+    err = capsys.readouterr().err
+    for name in ("now.csv", "before.csv"):
+        words = f"warning: {tmp_path / name}: no unit is said: times as s, places as m."
+        assert err.count(words) == 1
+    assert err.count("warning: ") == 2
+    assert main(["sweep", "sweeps/drill", "--no-figures", "--quiet"]) == 0
+    assert not capsys.readouterr().err
+
+
 def test_vehicles_of_files_keep_their_names(tmp_path):
     """An earlier version in another order of its vehicles is the same, and the worst two are named."""
     show, every = day(tmp_path, 2), np.arange(3)

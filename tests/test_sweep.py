@@ -6,6 +6,7 @@ import logging
 import math
 import os
 import random
+import re
 import shutil
 import signal
 import sqlite3
@@ -312,7 +313,12 @@ FOUND = "narrow-passage-found"  # searches its way through a gap
 
 @pytest.mark.parametrize(
     ("line", "searches"),
-    [("constraint.alpha = grid(0.4, 0.6)", 1), ("obstacles.3.min.1 += grid(0, 0.4)", 2)],
+    [
+        ("constraint.alpha = grid(0.4, 0.6)", 1),
+        ("tracking.Q.1 = grid(3, 9)", 1),
+        ("agents.mass.1 = grid(1, 1.2)", 2),
+        ("obstacles.3.min.1 += grid(0, 0.4)", 2),
+    ],
 )
 def test_a_way_is_searched_once_where_nothing_that_varies_matters_to_it(
     monkeypatch, line, searches
@@ -345,10 +351,16 @@ def test_what_matters_in_flight_alone_changes_no_way():
     noise = {"position": 0.02, "velocity": 0.05, "rate": 20.0, "seed": 3}
     gusts = {"model": "dryden", "altitude": 20.0, "correlation_length": 20.0, "seed": 1}
     air = {"wind": [3.0, 1.0, 0.0], "drag": 0.4, "mass_error": 0.1, "gusts": gusts, "noise": noise}
-    other = {"integrator": {"rtol": 1e-5}, "constraint": {"alpha": 0.6}, "disturbances": air}
+    other = {
+        "integrator": {"rtol": 1e-5},
+        "constraint": {"alpha": 0.6},
+        "tracking": {"Q": [9.0, 5.0]},
+        "disturbances": air,
+    }
     for keys in [
         ("integrator", "rtol"),
         ("constraint", "alpha"),
+        ("tracking", "Q", 0),
         *(("disturbances", k) for k in air),
     ]:
         assert not can_affect_plan(written, keys)
@@ -361,7 +373,7 @@ def test_what_matters_in_flight_alone_changes_no_way():
         "agents.position.1",
         "agents.mass",
         "obstacles.2",
-        "tracking.Q",
+        "lqr.S",
         "disturbances.lost",
     ):
         assert can_affect_plan(written, tuple(path.split(".")))
@@ -369,6 +381,32 @@ def test_what_matters_in_flight_alone_changes_no_way():
     del settling[0]["until"]
     assert can_affect_plan(Mission.from_dict(PAIR | {"phases": settling}), ("constraint", "alpha"))
     assert can_affect_plan(load_mission("passage-quadrotors"), ("constraint", "alpha"))
+
+
+def test_tracking_matters_where_a_body_arrives_before_its_phase_ends():
+    """It then comes to rest by tracking, and only from rest a way begins: slow gains leave it in motion."""
+    tables = load_mission(FOUND).to_dict()
+    tables["phases"][-3]["travel"] = 6.0
+    tables["lqr"]["S"] = [1e3, 0.0]  # the velocity on arrival is free
+    written = Mission.from_dict(tables | {"tracking": {"Q": [40.0, 40.0]}})
+    assert can_affect_plan(written, ("tracking", "Q"))
+    assert len(expand_mission(written).phases) > len(written.phases)
+    with pytest.raises(MissionError, match="a way begins at rest"):
+        expand_mission(Mission.from_dict(tables | {"tracking": {"Q": [0.1, 0.1]}}))
+
+
+def test_air_and_noise_move_ways_to_own_places():
+    """Ways home keep room for what drag does, which tracking answers to; only tolerances leave them."""
+    tables = load_mission("change-of-picture").to_dict()
+    tables["phases"][-1]["places"] = "own"
+    home = Mission.from_dict(tables)
+    for path in ("disturbances.wind", "disturbances.noise", "tracking.Q", "constraint.alpha"):
+        assert can_affect_plan(home, tuple(path.split(".")))
+    assert not can_affect_plan(home, ("integrator", "rtol"))
+    assert len(expand_mission(home).phases) > len(home.phases)
+    air = {"drag": 0.3, "wind": [6.0, 0.0, 0.0]}
+    with pytest.raises(MissionError, match="straight to their own"):
+        expand_mission(Mission.from_dict(tables | {"disturbances": air}))
 
 
 def test_a_sweep_without_a_way_says_so_in_each_row():
@@ -463,6 +501,29 @@ def test_what_is_no_store(tmp_path):
     with pytest.raises(ResultError, match="is damaged or not the store"):
         fly(sweep(runs=3), tmp_path, workers=1)
     assert (tmp_path / "sweep.db").read_bytes().startswith(b"not a database")
+
+
+def test_a_store_without_its_table_is_as_absent(tmp_path):
+    """What a store killed as it began leaves, a file that is empty or a head alone, is no sweep; the call fills it."""
+    for name in ("empty", "shards/2-of-2"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "sweep.db").touch()
+    (tmp_path / "head").mkdir()
+    with closing(sqlite3.connect(tmp_path / "head" / "sweep.db")) as db:
+        db.execute("PRAGMA journal_mode = WAL")
+        db.execute("PRAGMA user_version = 1")
+    assert (tmp_path / "head" / "sweep.db").stat().st_size
+    for name in ("empty", "head"):
+        with pytest.raises(ResultError, match=f"{name}: contains no sweep"):
+            read(tmp_path / name)
+        assert fly(sweep(runs=3), tmp_path / name, workers=1).complete
+    with pytest.raises(ResultError, match="shards: contains no sweep"):
+        merge(tmp_path)
+    parts(tmp_path, "1/2")
+    with pytest.raises(ResultError, match="missing or partly flown: 2\\. Fly"):
+        merge(tmp_path)
+    parts(tmp_path, "2/2")
+    assert merge(tmp_path).complete
 
 
 def test_a_group_is_never_split():
@@ -680,7 +741,7 @@ def test_a_shard_that_is_missing_or_partly_flown_is_named(tmp_path):
         merge(tmp_path)
     words = str(caught.value)
     assert "of 3 shards, these are missing or partly flown: 1 (has 8 of 24 runs), 3." in words
-    assert f"`rigidfleet sweep {tmp_path} --shard 1/3`" in words
+    assert f"`rigidfleet sweep {tmp_path} --shard 1/3 --runs 60`" in words
     assert not (tmp_path / "sweep.db").exists()
     seen: list[SweepProgress] = []
     fly(asked, tmp_path, workers=1, shard="1/3", progress=seen.append)
@@ -695,12 +756,11 @@ def change(folder: Path, words: str) -> None:
 
 
 def test_shards_that_do_not_fit_are_refused(tmp_path, monkeypatch):
-    """What differs is named: seed, runs, number of shards, mission, version."""
+    """What differs is named: seed, number of shards, mission, version."""
     odd = Mission.from_dict(PAIR | {"output_step": 0.05})
     for k, (shard, asked, words) in enumerate(
         (
             ("2/2", sweep(seed=4), "seed"),
-            ("2/2", sweep(runs=19), "number of runs"),
             ("2/3", sweep(), "number of shards"),
             ("2/2", sweep(mission=odd), "mission"),
             ("2/2", sweep(), "version"),
@@ -793,6 +853,61 @@ def test_an_executor_that_dies_is_a_sentence(flown, tmp_path, monkeypatch, capsy
     with Dying(1) as pool, pytest.raises(RigidfleetError):
         fly(asked, tmp_path / "again", pool=pool, workers=1)
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        MemoryError("no room"),
+        OSError("no library"),
+        RuntimeError("can't start new thread"),
+        RigidfleetError("RIGIDFLEET_LEVEL: no"),
+    ],
+)
+def test_a_fault_of_the_machine_is_no_row(flown, fault, tmp_path, monkeypatch):
+    """It ends the chunk, in this process and in a worker, in flight and in the verdict; elsewhere the sweep goes on."""
+
+    def fail(*_: Any) -> Any:
+        raise fault
+
+    for place in ("simulation.together.simulate_together", "assessment.assess"):
+        with monkeypatch.context() as short, ThreadPoolExecutor(1) as pool:
+            short.setattr(f"rigidfleet.{place}", fail)
+            with pytest.raises(RigidfleetError, match=re.escape(str(fault))):
+                fly(sweep(), tmp_path, workers=1)
+            words = rf"a worker failed: .*{fault}\. .*: 0 of 20 runs are saved; the same command"
+            with pytest.raises(RigidfleetError, match=words):
+                fly(sweep(), tmp_path, pool=pool, workers=1)
+    assert not len(read(tmp_path).run)
+    assert numbers(fly(sweep(), tmp_path, workers=1)) == numbers(flown)
+
+
+def test_a_worker_that_cannot_run_the_level_says_so(tmp_path, monkeypatch):
+    """A worker's machine is asked before it flies, so that no row is false."""
+    monkeypatch.setenv("RIGIDFLEET_LEVEL", "x86-64-v9")
+    words = r"a worker failed: RIGIDFLEET_LEVEL: this machine cannot run 'x86-64-v9'.*0 of 20 runs"
+    with ThreadPoolExecutor(1) as pool, pytest.raises(RigidfleetError, match=words):
+        fly(sweep(), tmp_path, pool=pool, workers=1)
+
+
+@pytest.mark.parametrize(
+    ("keys", "error", "words"),
+    [
+        ({"workers": 0}, TypeError, "a whole number of workers, 1 or more, got 0"),
+        ({"workers": -2}, TypeError, "got -2"),
+        ({"workers": 1.5}, TypeError, "got 1.5"),
+        ({"workers": "2"}, TypeError, "got '2'"),
+        ({"pool": 0, "workers": 0}, TypeError, "got 0"),
+        ({"pool": 0, "cluster": "tcp://127.0.0.1:9"}, RigidfleetError, "exclude each other"),
+        ({"pool": 0}, RigidfleetError, "takes no work: RuntimeError: .* after shutdown.* 0 of 20"),
+    ],
+)
+def test_workers_that_cannot_be_are_one_error(keys, error, words, tmp_path):
+    """Numbers of workers that are none, an executor beside a cluster, and one that is shut down."""
+    pool = ThreadPoolExecutor(1)
+    pool.shutdown()
+    with pytest.raises(error, match=words):
+        fly(sweep(), tmp_path, **keys | ({"pool": pool} if "pool" in keys else {}))
 
 
 def test_a_pool_that_breaks_as_it_is_given_work_loses_none(tmp_path, monkeypatch, caplog):
@@ -1364,6 +1479,29 @@ def test_the_command_flies_shards(folder, capsys):
     assert Path("sweeps/pair/figures/outcome.png").exists()
 
 
+@pytest.mark.parametrize("grown", [[1, 2, 4], [1]])
+def test_the_repair_that_merging_names_makes_one_sweep(folder, capsys, grown):
+    """A shorter sweep lies in the folder, or shorter shards: what merging names is flown, one after the other."""
+    line = ["sweep", "pair.toml", "--vary", SCATTER[0], "--seed", "3", "--quiet", "--runs"]
+    assert cli.main([*line, "12"]) == codes.PASSED
+    for k in (1, 2, 4):
+        runs, idle = ("61", False) if k in grown else ("12", k > 2)
+        with pytest.warns(UserWarning, match="nothing to fly") if idle else nullcontext():
+            assert cli.main([*line, runs, "--shard", f"{k}/4"]) == codes.PASSED
+    repairs = []
+    while cli.main(["sweep", "sweeps/pair", "--merge", "--quiet"]):
+        named = re.search("`rigidfleet ([^`]*)`", capsys.readouterr().err)
+        assert named is not None
+        repairs.append(named[1])
+        assert cli.main([*named[1].split(), "--quiet"]) == codes.PASSED
+    missing = [k for k in range(1, 5) if k not in grown]
+    assert repairs == [f"sweep sweeps/pair --shard {k}/4 --runs 61" for k in missing]
+    whole = fly(sweep(SCATTER[0], runs=61), folder / "whole", workers=1)
+    assert numbers(read("sweeps/pair")) == numbers(whole)
+    assert cli.main(["sweep", "sweeps/pair", "--shard", "2/4", "--quiet"]) == codes.PASSED
+    assert read("sweeps/pair/shards/2-of-4").sweep.runs == 61
+
+
 def test_progress_words():
     """Progress says the runs flown, their rate without starts, the time left and the failures."""
     watch = console.SweepWatch()
@@ -1709,7 +1847,7 @@ def test_a_worker_with_another_controller_is_refused(folder):
 
     Path("c_law.py").write_text(LAW)
     found = Sweep.of(MISSION, SCATTER, runs=2, controller="c_law:follow")
-    with pytest.raises(RigidfleetError, match=r"a worker has rigidfleet .* with c_law:follow"):
+    with pytest.raises(RigidfleetError, match=r"it has rigidfleet .* with c_law:follow"):
         fly_chunk(found.json(), found.version.replace("c_law:follow ", "c_law:follow x"), [0])
 
 
@@ -1750,6 +1888,33 @@ def test_a_full_disk_is_named_and_the_sweep_goes_on(flown, tmp_path, monkeypatch
         with pytest.raises(ResultError, match=r"the disk is full\. Make room"):
             fly(sweep(), tmp_path, workers=1)
     assert numbers(fly(sweep(), tmp_path, workers=1)) == numbers(flown)
+
+
+@pytest.mark.parametrize("shard", [[], ["--shard", "2/2"]])
+def test_a_sweep_that_was_stopped_before_its_first_run_goes_on_by_its_definition(
+    folder, capsys, monkeypatch, shard
+):
+    """Where the disk is full at the start, the folder has a lock and perhaps an empty file: it says how to go on."""
+    from rigidfleet.sweep.store import Store
+
+    def full(self: Store, asked: Sweep) -> None:
+        raise sqlite3.OperationalError("database or disk is full")
+
+    line = ["sweep", "pair.toml", "--vary", SCATTER[1], "--runs", "20", "--quiet", *shard]
+    with monkeypatch.context() as no_room:
+        no_room.setattr(Store, "_open_database", full)
+        assert cli.main(line) == codes.BAD_INPUT
+    assert "the disk is full" in capsys.readouterr().err
+    again = ["sweep", "sweeps/pair", *shard]
+    for file in Path("sweeps").rglob("sweep.db"):
+        assert not file.stat().st_size
+        assert cli.main(again) == codes.BAD_INPUT
+        assert "Go on by the command that defines it" in capsys.readouterr().err
+        file.unlink()
+    assert cli.main(again) == codes.BAD_INPUT
+    err = capsys.readouterr().err
+    assert "sweeps/pair: the sweep in it was stopped before its first run. Go on by" in err
+    assert cli.main(line) == codes.PASSED
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is sent as a signal")

@@ -206,16 +206,21 @@ def _sweep_and_folder(
     from rigidfleet.sweep.definition import is_sweep_file
 
     here = Path(what)
-    if stored := [here] * store.is_store(here) or (shards.shard_folders(here) if shard else []):
+    if stored := (shards.shard_folders(here) if shard else []) or [here] * store.is_store(here):
         if vary or out is not None or of_others or any(x is not None for x in keys.values()):
             raise RigidfleetError(
                 f"{what}: is the folder of a sweep, whose definition cannot change. Remove all options that define one:"
                 " only --runs may grow."
             )
-        definition = store.read(stored[0]).sweep
+        definition = max((store.read(x).sweep for x in stored), key=lambda sweep: sweep.runs)
         definition.runs = definition.runs if runs is None else runs
         return definition, here
     named = what in mission_names()
+    if not named and (shards.shard_folder(here, shard) / store.LOCK).exists():
+        words = (
+            "the sweep in it was stopped before its first run. Go on by the command that defines it"
+        )
+        raise RigidfleetError(f"{what}: {words}, by its mission and --vary.")
     others = keys["drill"] is not None and not named and here.suffix != ".toml" and here.exists()
     if of_others and not others and (named or here.exists()):
         raise RigidfleetError(
@@ -228,6 +233,8 @@ def _sweep_and_folder(
         definition = Sweep.of(mission, vary, runs=runs, origin="rigidfleet sweep", **keys)
     elif not named and is_sweep_file(what):
         definition = Sweep.load(what, more=vary, runs=runs, **keys)
+        for file, note in definition.drill.notes_on_files() if definition.drill else ():
+            console.warn(f"{file}: {note}.")
     else:
         definition = Sweep.of(what, vary, runs=runs, origin="rigidfleet sweep", **keys)
     return definition, out or Path("sweeps", definition.name)

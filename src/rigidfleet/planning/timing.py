@@ -58,9 +58,14 @@ def expand_mission(mission: Mission) -> Mission:
 
 def can_affect_plan(mission: Mission, keys: Keys) -> bool:
     """Whether `expand_mission` may depend on a key of a mission."""
-    free = _IN_FLIGHT
-    if mission.vehicle_models is None and all(p.settle is None for p in mission.phases):
+    phases, free = mission.phases, _IN_FLIGHT
+    if any(p.vertical is not None and not p.flown_as_written for p in phases):
+        free = free[:1]  # ways to own places keep room for what air and noise do
+    elif mission.vehicle_models is None and all(p.settle is None for p in phases):
         free += _IN_FLIGHT_OF_POINTS
+        # By tracking, the body of a mission that is not smooth comes to rest if it arrives before its phase ends.
+        if mission.smooth or all(p.time_key != "travel" for p in phases):
+            free += (("tracking",),)
     return not any(keys[: len(x)] == x for x in free)
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -102,6 +102,21 @@ class Drill(Part):
     def reading(self) -> dict[str, Any]:
         """How its files are read: options of `foreign.files.read_trajectories`."""
         return {name: getattr(self, name) for name in READING}
+
+    def notes_on_files(self) -> Iterator[tuple[str, str]]:
+        """The notes on the files that it names, each with the first of those that are read together.
+
+        Raises
+        ------
+        TrajectoryError
+            They cannot be read.
+        """
+        from rigidfleet.foreign.files import read_trajectories
+
+        versions = [(name,) for name in self.stale if not names_mission(name)]
+        for files in filter(None, (self.files, *versions)):
+            for note in read_trajectories(files, spans="stand", **self.reading).notes:
+                yield files[0], note
 
     def with_files_in_folder(self, folder: Path) -> Drill:
         """The same, with files as seen from a folder; names of shipped missions stay."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet.errors import FlightError, MissionError
+from rigidfleet.errors import FlightError, MissionError, RigidfleetError
 from rigidfleet.mission import Mission
 from rigidfleet.sweep import faults
 from rigidfleet.sweep.definition import Sweep
@@ -29,6 +29,11 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
 
     Except for `wall`, a record depends only on the sweep and the number of the run. A run that cannot be flown has a
     record with the reason.
+
+    Raises
+    ------
+    RigidfleetError
+        This machine cannot fly them, or the show of a drill cannot be drilled.
     """
     if sweep.evaluate == "final":
         from rigidfleet.sweep.final_states import fly_final_states
@@ -105,12 +110,22 @@ def _fly_group(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
 
 
 def _value_or_error(job: Callable[[], Any]) -> Any:
-    """What a function returns, or its exception: one failed run must not end the sweep."""
+    """What a function returns, or its exception: one failed run must not end the sweep.
+
+    Raises
+    ------
+    RigidfleetError
+        This machine lacks memory, threads, files or code that it can run: another may fly the run.
+    """
     try:
         return job()
     except Exception as error:
-        if isinstance(error.__context__ or error.__cause__, KeyboardInterrupt):
-            raise  # Ctrl-C, turned into another exception by the compiler
+        before = error.__context__ or error.__cause__
+        if isinstance(before, KeyboardInterrupt) or type(error) is RigidfleetError:
+            raise  # Ctrl-C, turned into another exception by the compiler; or a sentence that names the machine's fault
+        out = (isinstance(x, MemoryError) or "start new thread" in str(x) for x in (error, before))
+        if isinstance(error, OSError) or any(out):
+            raise RigidfleetError(f"{type(error).__name__}: {error}") from error
         return error
 
 

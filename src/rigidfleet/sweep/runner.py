@@ -98,13 +98,20 @@ def fly(
     ResultError
         The folder contains another sweep or cannot be written.
     RigidfleetError
-        The cluster does not answer or ends, workers keep dying, the controller cannot be imported, or there is no such
-        shard. Finished runs are in the store, and the same call resumes the sweep.
+        The cluster does not answer or ends, a worker cannot fly, workers keep dying, the executor takes no work, the
+        controller cannot be imported, or there is no such shard. Finished runs are in the store, and the same call
+        resumes the sweep. Or there are both ``pool`` and ``cluster``.
+    TypeError
+        ``pool`` is no executor, or ``workers`` no number of workers.
     KeyboardInterrupt
         On Ctrl-C. Finished runs are in the store, and the same call resumes the sweep.
     """
     if not isinstance(pool, Executor | None):
         raise wrong_type("an Executor of concurrent.futures as pool", pool)
+    if workers is not None and (not isinstance(workers, int) or workers < 1):
+        raise wrong_type("a whole number of workers, 1 or more", workers)
+    if pool is not None and cluster is not None:
+        raise RigidfleetError("pool and cluster exclude each other: use one of them.")
     own, folder = runs_of_shard(shard, sweep.runs), shard_folder(Path(folder), shard)
     if not own.any():
         words = f"{sweep.runs} runs, in groups of {GROUP}, are enough for K/N with N up to {-(-sweep.runs // GROUP)}"
@@ -150,11 +157,23 @@ class _Sweeping:
         self.report_progress(1)
 
     def fly_in_this_process(self, *, until_worth: bool) -> None:
-        """Fly in this process: all runs, or until the remaining work justifies more processes."""
+        """Fly in this process: all runs, or until the remaining work justifies more processes.
+
+        Raises
+        ------
+        RigidfleetError
+            This machine cannot fly them.
+        """
         while self.missing:
             if until_worth and self.pace * GROUP * len(self.missing) > WORTH:
                 return
-            self.store_records(fly_runs(self.sweep, self.take_chunk(1)))
+            try:
+                rows = fly_runs(self.sweep, self.take_chunk(1))
+            except RigidfleetError as error:
+                if error.__cause__ is None:  # nothing that was saved helps
+                    raise
+                raise self.failure(pools.why_failed(error, "this process failed")) from error
+            self.store_records(rows)
             self.report_progress(1)
 
     def fly_by_executor(self, executor: Executor, capacity: Callable[[], int]) -> None:
@@ -169,10 +188,9 @@ class _Sweeping:
         def call_or_fail(call: Callable[..., Any], *arguments: Any) -> Any:
             try:
                 return call(*arguments)
-            except RigidfleetError:
-                raise
             except Exception as error:
-                raise self.failure(pools.why_failed(error)) from error
+                who = "the executor takes no work" if call == executor.submit else "a worker failed"
+                raise self.failure(pools.why_failed(error, who)) from error
 
         flying: dict[Future[list[RunRecord]], list[int]] = {}
         taken: list[int] = []

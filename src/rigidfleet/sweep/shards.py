@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidfleet.errors import ResultError, RigidfleetError
 from rigidfleet.sweep.run import GROUP
-from rigidfleet.sweep.store import FILE, Store, Table, diff_names, outcome_of, read, store_contents
+from rigidfleet.sweep.store import Store, Table, diff_names, is_store, outcome, read, store_contents
 from rigidfleet.typing import Bools, Ints
 
 #: Folder of the shards in the folder of their sweep.
@@ -39,7 +39,7 @@ def shard_folder(folder: Path, shard: str) -> Path:
 
 def shard_folders(folder: Path) -> list[Path]:
     """Folders of the shards that are in the folder of a sweep."""
-    return sorted(path.parent for path in folder.glob(f"{_SHARDS}/*/{FILE}"))
+    return sorted(path for path in folder.glob(f"{_SHARDS}/*") if is_store(path))
 
 
 def merge(folder: str | Path, *, replace: bool = False) -> Table:
@@ -47,7 +47,8 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
 
     Parameters
     ----------
-    folder : shards are all stores in folders of its folder `shards`, whatever their names
+    folder : shards are all stores in folders of its folder `shards`, whatever their names; the sweep has as many runs
+        as the longest of them
     replace : overwrite another sweep that is in the folder
 
     Raises
@@ -59,7 +60,7 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
     folder = Path(folder)
     paths = shard_folders(folder) or [folder / _SHARDS]
     stored = [store_contents(path) for path in paths]
-    sweep, common, _ = stored[0]
+    (_, common, _), sweep = stored[0], max((own for own, *_ in stored), key=lambda x: x.runs)
     rows: dict[int, tuple[Path, tuple[Any, ...]]] = {}
     for path, (_, own, part) in zip(paths, stored, strict=True):
         if own != common:
@@ -67,7 +68,7 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
             raise ResultError(f"{path}: does not fit {paths[0]}; it differs in: {other}. {_MOVE}")
         for row in part:
             where, same = rows.setdefault(row[0], (path, row))
-            if outcome_of(row) != outcome_of(same):
+            if outcome(row) != outcome(same):
                 raise ResultError(f"{path}: run {row[0]} is not as in {where}. {_MOVE}")
     shards = _shard_of_runs(sweep.runs, count := common["number of shards"])
     total, flown = (np.bincount(x, minlength=count + 1) for x in (shards, shards[[*rows]]))
@@ -77,7 +78,7 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
         ]
         raise ResultError(
             f"{folder}: of {count} shards, these are missing or partly flown: {', '.join(words)}. Fly each, as by"
-            f" `rigidfleet sweep {folder} --shard {lacking[0]}/{count}`, and merge again."
+            f" `rigidfleet sweep {folder} --shard {lacking[0]}/{count} --runs {sweep.runs}`, and merge again."
         )
     with Store(folder, sweep, "", replace) as store:
         store.insert_rows(row for _, row in rows.values())

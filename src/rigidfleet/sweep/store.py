@@ -31,7 +31,7 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 FILE = "sweep.db"
 #: Locked by the process that writes. The lock ends with the process, even if that is killed.
-_LOCK = "sweep.lock"
+LOCK = "sweep.lock"
 #: Version of the format, stored as `user_version`; 0 in files of the first format.
 _FORMAT = 3
 #: Space on a disk that SQLite needs to work, and reports as errors of all kinds if it has less [bytes].
@@ -39,7 +39,7 @@ _ROOM = 1 << 20
 _COLUMNS = ("run", "passed", "reason", "detail", "wall", "level", "codes", *METRICS)
 _KINDS = {"passed": "INTEGER", "reason": "TEXT", "detail": "TEXT", "level": "TEXT", "codes": "BLOB"}
 #: Of a row in the order of the columns: what depends on the sweep alone, not on who flew it.
-outcome_of = itemgetter(*(k for k, x in enumerate(_COLUMNS) if x not in ("wall", "level")))
+outcome = itemgetter(*(k for k, x in enumerate(_COLUMNS) if x not in ("wall", "level")))
 #: Little-endian, so that the file can be read on every machine.
 _CODES = np.dtype("<f8")
 
@@ -89,7 +89,7 @@ class Store:
         self.path, self.shard = folder / FILE, shard
         with _as_result_errors(self.path), ExitStack() as opened:
             folder.mkdir(parents=True, exist_ok=True)
-            lock = sqlite3.connect(folder / _LOCK, timeout=0.0, isolation_level=None)
+            lock = sqlite3.connect(folder / LOCK, timeout=0.0, isolation_level=None)
             opened.enter_context(closing(lock)).execute("BEGIN EXCLUSIVE")
             if replace:
                 for end in ("-wal", "-shm", "-journal", ""):
@@ -174,13 +174,22 @@ class Store:
 
 
 def _column_names(db: sqlite3.Connection) -> set[str]:
-    """Columns of a store: one that an earlier version wrote may lack metrics."""
+    """Columns of a store: none of a new file; one that an earlier version wrote may lack metrics."""
     return {name for _, name, *_ in db.execute("PRAGMA table_info(runs)")}
 
 
 def is_store(folder: Path) -> bool:
-    """Whether a folder contains a sweep."""
-    return (folder / FILE).is_file()
+    """Whether a folder contains a sweep: the file of one that was killed as it began has no table yet.
+
+    Raises
+    ------
+    ResultError
+        The file is damaged or cannot be read.
+    """
+    if not (path := folder / FILE).is_file():
+        return False
+    with _as_result_errors(path), closing(sqlite3.connect(path)) as db:
+        return bool(_column_names(db))
 
 
 def read(folder: str | Path) -> Table:
@@ -192,20 +201,15 @@ def read(folder: str | Path) -> Table:
         The folder does not contain a sweep.
     """
     sweep, _, rows = store_contents(Path(folder))
-    run, passed, reason, detail, wall, level, codes, *metrics = list(zip(*rows, strict=True)) or [
-        () for _ in _COLUMNS
-    ]
+    columns = list(zip(*rows, strict=True)) or [()] * len(_COLUMNS)
+    run, passed, reason, detail, wall, level, codes, *metrics = columns
     return Table(
-        sweep,
-        np.array(run, dtype=np.int64),
-        np.array(passed, dtype=bool),
-        np.array(reason, dtype=object),
+        sweep, np.array(run, dtype=np.int64), np.array(passed, dtype=bool), np.array(reason, dtype=object),
         np.array(detail, dtype=object),
         np.frombuffer(b"".join(codes), dtype=_CODES).reshape(len(run), len(sweep.columns)),
         {name: np.array(x, dtype=np.float64) for name, x in zip(METRICS, metrics, strict=True)},
-        np.array(wall, dtype=np.float64),
-        dict(Counter(filter(None, level))),
-    )
+        np.array(wall, dtype=np.float64), dict(Counter(filter(None, level))),
+    )  # fmt: skip
 
 
 def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any, ...]]]:
@@ -217,14 +221,13 @@ def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any,
         The folder does not contain a sweep.
     """
     path = folder / FILE
-    if not path.is_file():
+    if not is_store(folder):
         raise ResultError(f"{folder}: contains no sweep. `rigidfleet sweep` creates one.")
     with _as_result_errors(path), closing(sqlite3.connect(path)) as db:
         _check_format(db, folder)
         entries = dict(db.execute("SELECT key, value FROM sweep"))
         sweep = Sweep.from_json(entries["sweep"])
-        shards = int(entries.get("shard", "").partition("/")[2] or 1)
-        common = {"number of runs": sweep.runs, "number of shards": shards}
+        common = {"number of shards": int(entries.get("shard", "").partition("/")[2] or 1)}
         known = _column_names(db)
         names = ", ".join(f'"{name}"' if name in known else "NULL" for name in _COLUMNS)
         rows = db.execute(f"SELECT {names} FROM runs ORDER BY run").fetchall()
@@ -233,7 +236,7 @@ def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any,
 
 def _check_format(db: sqlite3.Connection, folder: Path) -> None:
     """Raise ResultError if a store has another format."""
-    if db.execute("SELECT 1 FROM sqlite_master WHERE name = 'sweep'").fetchone() is None:
+    if not _column_names(db):
         return  # a new file
     made = max(1, db.execute("PRAGMA user_version").fetchone()[0])
     older = "Fly the sweep again: use --force to overwrite, or --out to choose another folder"

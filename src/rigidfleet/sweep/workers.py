@@ -16,6 +16,7 @@ from typing import Any
 
 from rigidfleet._common.processes import set_python_safe_path
 from rigidfleet.errors import RigidfleetError
+from rigidfleet.kernel.compiler.levels import runnable_instruction_level
 from rigidfleet.sweep.definition import sweep_of_json
 from rigidfleet.sweep.record import RunRecord
 from rigidfleet.sweep.run import fly_runs
@@ -30,14 +31,13 @@ def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
     Raises
     ------
     RigidfleetError
-        The other process has another version of rigidfleet, or of the user's controller.
+        The other process has another version of rigidfleet, or of the user's controller; or this machine cannot fly.
     """
     flown = sweep_of_json(sweep)
     if version != flown.version:
-        raise RigidfleetError(
-            f"a worker has {flown.version}, but the sweep was started by {version}. Install the same version on all"
-            " machines."
-        )
+        words = "Install the same version on all machines"
+        raise RigidfleetError(f"it has {flown.version}, and the sweep {version}. {words}.")
+    runnable_instruction_level()
     return fly_runs(flown, runs)
 
 
@@ -131,10 +131,11 @@ def open_cluster(address: str) -> Generator[tuple[Executor, Callable[[], int]]]:
         log.setLevel(before)
 
 
-def why_failed(error: Exception) -> str:
-    """Why work that was handed to an executor did not come back, and what to do."""
+def why_failed(error: Exception, who: str) -> str:
+    """Why work that was handed to an executor did not come back, and what to do; ``who`` failed, if nobody died."""
     if isinstance(error, CancelledError | OSError):
         return "the scheduler of the cluster ended, or the connection to it."
     if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # Dask's
         return "workers died. If memory is short, use fewer of them; a script needs `if __name__ == '__main__':`."
-    return f"a worker failed: {type(error).__name__}: {error}."
+    name = "" if isinstance(error, RigidfleetError) else f"{type(error).__name__}: "
+    return f"{who}: {name}{str(error).removesuffix('.')}."
