@@ -53,10 +53,14 @@ def load(folder: str | Path) -> xarray.Dataset:
         variables,
         coords={"run": ("run", table.run, about)},
         attrs={
-            "title": f"sweep of the mission {sweep.mission.name}", "seed": sweep.seed, "runs": sweep.runs,
-            "complete": int(table.complete), "mission": sweep.mission.text, "version": sweep.identity["version"],
+            "title": f"sweep of the mission {sweep.mission.name}",
+            "seed": sweep.seed,
+            "runs": sweep.runs,
+            "complete": int(table.complete),
+            "mission": sweep.mission.text,
+            "version": sweep.identity["version"],
         },
-    )  # fmt: skip
+    )
 
 
 def unit_and_meaning(sweep: Sweep, column: SweepColumn) -> tuple[str, str]:

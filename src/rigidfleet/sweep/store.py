@@ -204,12 +204,16 @@ def read(folder: str | Path) -> Table:
     columns = list(zip(*rows, strict=True)) or [()] * len(_COLUMNS)
     run, passed, reason, detail, wall, level, codes, *metrics = columns
     return Table(
-        sweep, np.array(run, dtype=np.int64), np.array(passed, dtype=bool), np.array(reason, dtype=object),
+        sweep,
+        np.array(run, dtype=np.int64),
+        np.array(passed, dtype=bool),
+        np.array(reason, dtype=object),
         np.array(detail, dtype=object),
         np.frombuffer(b"".join(codes), dtype=_CODES).reshape(len(run), len(sweep.columns)),
         {name: np.array(x, dtype=np.float64) for name, x in zip(METRICS, metrics, strict=True)},
-        np.array(wall, dtype=np.float64), dict(Counter(filter(None, level))),
-    )  # fmt: skip
+        np.array(wall, dtype=np.float64),
+        dict(Counter(filter(None, level))),
+    )
 
 
 def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any, ...]]]:

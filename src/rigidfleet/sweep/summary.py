@@ -252,10 +252,20 @@ def summarise(table: store.Table) -> Summary:
     seeded = any(column.keys[-1] == "seed" for column in sweep.columns)
     numbers = "varied" if seeded else sweep.header.random_numbers
     return Summary(
-        sweep.name, sweep.mission.name, sweep.runs, len(table.run), pass_rate(table.passed),
-        failure_counts(table.reason), _examples_by_reason(table), percentiles, correlations_by_strength(table),
-        by_value, numbers if sweep.has_random_flights else "none", table.levels, failure_rates(table),
-    )  # fmt: skip
+        sweep.name,
+        sweep.mission.name,
+        sweep.runs,
+        len(table.run),
+        pass_rate(table.passed),
+        failure_counts(table.reason),
+        _examples_by_reason(table),
+        percentiles,
+        correlations_by_strength(table),
+        by_value,
+        numbers if sweep.has_random_flights else "none",
+        table.levels,
+        failure_rates(table),
+    )
 
 
 def failure_rates(table: store.Table) -> list[Borne]:
