@@ -22,6 +22,7 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 import rigidfleet
+from test_levels import SEEMS
 from rigidfleet.kernel.compiler import levels
 
 ROOT = Path(__file__).parents[1]
@@ -308,16 +309,16 @@ def test_a_flight_from_the_wheel_needs_no_compiler(bare):
 @linux
 @pytest.mark.long
 def test_workers_fly_the_same_bits_on_a_level(bare):
-    """On one level of x86-64 the rows of a sweep do not depend on the number of workers."""
+    """On one level of x86-64 the rows of a sweep depend neither on the number of workers nor on the processor."""
     folder, run = bare
     vary = ("--vary", "disturbances.mass_error = normal(0, 0.02)", "--runs", "6", "--no-figures")
     flown: dict[str, list[list[tuple[object, ...]]]] = {}
     for name in levels.machine_instruction_levels():
         flown[name] = []
-        for workers in ("1", "2"):
+        for workers, seems in ("1", {}), ("2", SEEMS[name]):
             out = folder / f"{name}-{workers}"
             words = ("passage-quadrotors", *vary, "--workers", workers, "--out", str(out))
-            run("rigidfleet", "sweep", *words, RIGIDFLEET_LEVEL=name)
+            run("rigidfleet", "sweep", *words, RIGIDFLEET_LEVEL=name, **seems)
             with closing(sqlite3.connect(out / "sweep.db")) as store:
                 rows = store.execute("SELECT * FROM runs ORDER BY run")
                 wall = [column[0] for column in rows.description].index("wall")
@@ -343,3 +344,20 @@ def test_wheel_flies_on_its_own(bare):
     run("rigidfleet", "report", str(flown / "narrow-passage.nc"))
     assert (flown / "report.html").exists()
     run("python", "-c", "import rigidfleet as rf; [getattr(rf, name) for name in rf.__all__]")
+@linux
+@pytest.mark.long
+def test_flights_have_the_same_bits_on_a_level(bare):
+    """On one level of x86-64 a flight by the command is the same bit for bit, whatever the processor seems to be."""
+    folder, run = bare
+    for name in levels.machine_instruction_levels():
+        for mission in ("narrow-passage", "passage-quadrotors", "cube-passage", "moving-obstacles"):
+            flown = []
+            for seems in {}, SEEMS[name]:
+                out = folder / f"{name}-{mission}-{len(seems)}"
+                words = ("run", mission, "--no-figures", "--out", str(out))
+                run("rigidfleet", *words, RIGIDFLEET_LEVEL=name, **seems)
+                result = rigidfleet.Result.load(out / f"{mission}.nc")
+                flown.append([x.tobytes() for x in (result.time, result.position, result.velocity)])
+            assert flown[0] == flown[1], (name, mission)
+
+

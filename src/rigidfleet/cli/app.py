@@ -46,6 +46,7 @@ from rigidfleet.cli import (
 )
 from rigidfleet.cli.codes import BAD_INPUT, FAILED, INTERRUPTED, PASSED
 from rigidfleet.errors import RigidfleetError
+from rigidfleet.kernel.compiler import levels
 
 __all__ = ["BAD_INPUT", "FAILED", "INTERRUPTED", "PASSED", "app", "main"]
 
@@ -87,6 +88,8 @@ def main(tokens: Sequence[str] | None = None) -> int:
         warnings.showwarning = cast("Any", console.warn)
         # The matrices are small: several threads would only wait for each other, on a busy machine for long.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        for key, value in levels.LIBRARY_SETTINGS.get(os.environ.get(levels.KEY, ""), {}).items():
+            os.environ.setdefault(key, value)
     console.prepare_streams()
     try:
         with run.raise_interrupts() if tokens is None else nullcontext():
