@@ -88,6 +88,16 @@ def test_shipped_code_is_loaded(shipped, monkeypatch):
 
 
 @linux
+def test_a_damaged_object_is_named(shipped):
+    """A file of the package that is no shared object is named, with the remedy."""
+    shipped.write_bytes(b"")
+    with pytest.raises(
+        RigidfleetError, match=rf"{shipped.name}: file too short\. Install rigidfleet again\."
+    ):
+        answer()
+
+
+@linux
 def test_code_of_other_sources_is_not_loaded(shipped, base):  # noqa: F811
     """Where the installed sources are not those that the code was made of, they are compiled, with a warning; what was
     compiled of them is then taken from the cache, without one."""
@@ -145,11 +155,6 @@ def test_the_compiler_serves_the_level(monkeypatch):
         assert of(RIGIDFLEET_LEVEL=name) == [name, str(name == "x86-64-v4")]
 
 
-def test_a_refused_level_is_an_error_from_python(monkeypatch, machine):
-    """From Python a level that cannot be run is the package's own error."""
-    monkeypatch.setenv(levels.KEY, "x86-64-v4")
-    with pytest.raises(RigidfleetError, match="cannot run"):
-        native.has_machine_code()
 #: Settings by which this machine seems to be of a level, to libraries that choose code by processor.
 SEEMS = {
     "x86-64-v3": {"OPENBLAS_CORETYPE": "Zen", "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_SKX"},
@@ -185,3 +190,8 @@ def test_libraries_keep_to_a_fixed_level():
         assert digits(RIGIDFLEET_LEVEL=name) == digits(RIGIDFLEET_LEVEL=name, **SEEMS[name])
 
 
+def test_a_refused_level_is_an_error_from_python(monkeypatch, machine):
+    """From Python a level that cannot be run is the package's own error."""
+    monkeypatch.setenv(levels.KEY, "x86-64-v4")
+    with pytest.raises(RigidfleetError, match="cannot run"):
+        native.has_machine_code()
