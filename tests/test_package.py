@@ -12,17 +12,19 @@ import zipfile
 from contextlib import closing
 from datetime import date
 from functools import cache
+from importlib import import_module
 from importlib.metadata import packages_distributions
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import versions
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
+from test_levels import SEEMS
 
 import rigidfleet
-from test_levels import SEEMS
 from rigidfleet.kernel.compiler import levels
 
 ROOT = Path(__file__).parents[1]
@@ -231,6 +233,22 @@ linux = pytest.mark.skipif(
 )
 
 
+@pytest.mark.parametrize("lacking", ["cc", "nm"])
+def test_what_links_is_looked_for_first(lacking, monkeypatch):
+    """Where a program is lacking that makes shared objects, set-up names it, and compiles nothing."""
+    interface = SimpleNamespace(BuildHookInterface=object)  # hatchling's, which is not installed
+    monkeypatch.setitem(sys.modules, "hatchling.builders.hooks.plugin.interface", interface)
+    monkeypatch.syspath_prepend(ROOT)
+    build = import_module("hatch_build")
+    monkeypatch.setattr(build, "HERE", True)
+    monkeypatch.setattr(build.shutil, "which", lambda name: None if name == lacking else name)
+    hook, said, made = build.MachineCode(), [], {}
+    hook.app = SimpleNamespace(display_warning=said.append)  # without what announces compiling
+    hook.initialize("standard", made)
+    assert said == [f"The wheel has no machine code: no {lacking}"]
+    assert not made
+
+
 @linux
 @pytest.mark.long
 def test_machine_code_needs_little(built, tmp_path):
@@ -329,21 +347,6 @@ def test_workers_fly_the_same_bits_on_a_level(bare):
     assert len(flown) > 0
 
 
-@pytest.mark.long
-def test_wheel_flies_on_its_own(bare):
-    """Installed under the constraints into a bare environment, the wheel flies, far from the repository."""
-    folder, run = bare
-    at = run("python", "-c", "import rigidfleet; print(rigidfleet.__file__)")
-    assert Path(at.strip()).is_relative_to(folder / "bare")
-    out = run("rigidfleet", "run", "narrow-passage", "--replay", "--format", "png", "--force")
-    assert "Passed" in out
-    flown = folder / "flights" / "narrow-passage"
-    assert (flown / "narrow-passage.nc").stat().st_size > 100_000
-    assert "<canvas" in (flown / "replay.html").read_text(encoding="utf-8")
-    assert (flown / "figures" / "trajectory.png").exists()
-    run("rigidfleet", "report", str(flown / "narrow-passage.nc"))
-    assert (flown / "report.html").exists()
-    run("python", "-c", "import rigidfleet as rf; [getattr(rf, name) for name in rf.__all__]")
 @linux
 @pytest.mark.long
 def test_flights_have_the_same_bits_on_a_level(bare):
@@ -361,3 +364,18 @@ def test_flights_have_the_same_bits_on_a_level(bare):
             assert flown[0] == flown[1], (name, mission)
 
 
+@pytest.mark.long
+def test_wheel_flies_on_its_own(bare):
+    """Installed under the constraints into a bare environment, the wheel flies, far from the repository."""
+    folder, run = bare
+    at = run("python", "-c", "import rigidfleet; print(rigidfleet.__file__)")
+    assert Path(at.strip()).is_relative_to(folder / "bare")
+    out = run("rigidfleet", "run", "narrow-passage", "--replay", "--format", "png", "--force")
+    assert "Passed" in out
+    flown = folder / "flights" / "narrow-passage"
+    assert (flown / "narrow-passage.nc").stat().st_size > 100_000
+    assert "<canvas" in (flown / "replay.html").read_text(encoding="utf-8")
+    assert (flown / "figures" / "trajectory.png").exists()
+    run("rigidfleet", "report", str(flown / "narrow-passage.nc"))
+    assert (flown / "report.html").exists()
+    run("python", "-c", "import rigidfleet as rf; [getattr(rf, name) for name in rf.__all__]")
