@@ -46,6 +46,9 @@ class MachineCode(BuildHookInterface):
         """Make the shared objects, unless the package is only linked to its sources."""
         if not HERE or version == "editable":
             return
+        if lacking := [program for program in ("cc", "nm") if not shutil.which(program)]:
+            self.app.display_warning(f"The wheel has no machine code: no {' and '.join(lacking)}")
+            return
         sys.path.insert(0, str(Path(self.root, "src")))
         from rigidfleet.kernel.compiler.cache import sources_digest
         from rigidfleet.kernel.compiler.levels import LEVELS
@@ -57,13 +60,8 @@ class MachineCode(BuildHookInterface):
         jobs = list(product(LEVELS, objects.ENTRIES))
         # Each of these processes takes up to 600 MB.
         with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-            made = dict(
-                zip(
-                    jobs,
-                    pool.map(lambda job: objects.compile_objects(*job[::-1]), jobs),
-                    strict=True,
-                )
-            )
+            codes = pool.map(lambda job: objects.compile_objects(*job[::-1]), jobs)
+            made = dict(zip(jobs, codes, strict=True))
         include = {}
         try:
             if None in made.values():

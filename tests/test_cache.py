@@ -94,7 +94,7 @@ def test_a_folder_that_others_can_write(which, right, base):
     (only,) = warned
     text = str(only.message)
     assert f"others can write to {folder}; forbid it with `chmod go-w {folder}`" in text
-    assert "NUMBA_CACHE_DIR" in text
+    assert "compiles again what rigidfleet was not installed with. Set NUMBA_CACHE_DIR" in text
     folder.chmod(0o700)
     assert answer() == PLANTED
 

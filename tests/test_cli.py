@@ -160,6 +160,16 @@ def test_completion(tmp_path):
     )
 
 
+def test_a_home_that_cannot_be_written(tmp_path):
+    """A picture is drawn without a word about the home, where nothing can be written."""
+    (tmp_path / "file").touch()
+    usual = dict.fromkeys(("MPLCONFIGDIR", "XDG_CACHE_HOME", "XDG_CONFIG_HOME"), "")
+    drawn = ("--figure", str(tmp_path / "graph.svg"))
+    done = command("check", "two-agents", *drawn, **usual, HOME=str(tmp_path / "file" / "home"))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "graph.svg").exists()
+
+
 @pytest.mark.parametrize("verb", [name for name in cli.app if not name.startswith("-")])
 def test_help_breaks_no_line_that_fits(verb, monkeypatch, capsys):
     """On a wide terminal each paragraph of the help, and of each option, stands in one line."""

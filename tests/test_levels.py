@@ -88,6 +88,16 @@ def test_shipped_code_is_loaded(shipped, monkeypatch):
 
 
 @linux
+def test_a_damaged_object_is_named(shipped):
+    """A file of the package that is no shared object is named, with the remedy."""
+    shipped.write_bytes(b"")
+    with pytest.raises(
+        RigidfleetError, match=rf"{shipped.name}: file too short\. Install rigidfleet again\."
+    ):
+        answer()
+
+
+@linux
 def test_code_of_other_sources_is_not_loaded(shipped, base):  # noqa: F811
     """Where the installed sources are not those that the code was made of, they are compiled, with a warning; what was
     compiled of them is then taken from the cache, without one."""
@@ -143,6 +153,41 @@ def test_the_compiler_serves_the_level(monkeypatch):
     assert of()[0] == "None"
     for name in runs:
         assert of(RIGIDFLEET_LEVEL=name) == [name, str(name == "x86-64-v4")]
+
+
+#: Settings by which this machine seems to be of a level, to libraries that choose code by processor.
+SEEMS = {
+    "x86-64-v3": {"OPENBLAS_CORETYPE": "Zen", "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_SKX"},
+    "x86-64-v4": {"OPENBLAS_CORETYPE": "Cooperlake"},
+}
+#: Runs the command; then prints what follows from the code that OpenBLAS and NumPy have chosen.
+CHOSEN = """
+import sys
+from rigidfleet.__main__ import main
+sys.argv[1:] = ["missions"]
+main()
+import numpy as np
+x = np.linspace(0.1, 3.0, 900)
+print(np.linalg.inv(np.sin(x * x).reshape(30, 30)).tobytes().hex(), np.exp(x).tobytes().hex())
+"""
+
+
+def test_libraries_keep_to_a_fixed_level():
+    """In the command OpenBLAS and NumPy take the code of a fixed level, whatever the processor seems to be."""
+
+    def digits(**settings: str) -> str:
+        env = {k: v for k, v in os.environ.items() if not k.startswith(("OPENBLAS", "NPY"))}
+        command = [sys.executable, "-c", CHOSEN]
+        done = subprocess.run(
+            command, env=env | settings, capture_output=True, text=True, check=True
+        )
+        return done.stdout.splitlines()[-1]
+
+    page = Path(__file__).parents[1].joinpath("docs", "install.md").read_text("utf-8")
+    for name in levels.machine_instruction_levels():
+        for key, value in levels.LIBRARY_SETTINGS.get(name, {}).items():
+            assert f"{key}={value}" in page.replace('"', "")
+        assert digits(RIGIDFLEET_LEVEL=name) == digits(RIGIDFLEET_LEVEL=name, **SEEMS[name])
 
 
 def test_a_refused_level_is_an_error_from_python(monkeypatch, machine):

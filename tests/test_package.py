@@ -12,14 +12,17 @@ import zipfile
 from contextlib import closing
 from datetime import date
 from functools import cache
+from importlib import import_module
 from importlib.metadata import packages_distributions
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import versions
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
+from test_levels import SEEMS
 
 import rigidfleet
 from rigidfleet.kernel.compiler import levels
@@ -230,6 +233,22 @@ linux = pytest.mark.skipif(
 )
 
 
+@pytest.mark.parametrize("lacking", ["cc", "nm"])
+def test_what_links_is_looked_for_first(lacking, monkeypatch):
+    """Where a program is lacking that makes shared objects, set-up names it, and compiles nothing."""
+    interface = SimpleNamespace(BuildHookInterface=object)  # hatchling's, which is not installed
+    monkeypatch.setitem(sys.modules, "hatchling.builders.hooks.plugin.interface", interface)
+    monkeypatch.syspath_prepend(ROOT)
+    build = import_module("hatch_build")
+    monkeypatch.setattr(build, "HERE", True)
+    monkeypatch.setattr(build.shutil, "which", lambda name: None if name == lacking else name)
+    hook, said, made = build.MachineCode(), [], {}
+    hook.app = SimpleNamespace(display_warning=said.append)  # without what announces compiling
+    hook.initialize("standard", made)
+    assert said == [f"The wheel has no machine code: no {lacking}"]
+    assert not made
+
+
 @linux
 @pytest.mark.long
 def test_machine_code_needs_little(built, tmp_path):
@@ -308,16 +327,16 @@ def test_a_flight_from_the_wheel_needs_no_compiler(bare):
 @linux
 @pytest.mark.long
 def test_workers_fly_the_same_bits_on_a_level(bare):
-    """On one level of x86-64 the rows of a sweep do not depend on the number of workers."""
+    """On one level of x86-64 the rows of a sweep depend neither on the number of workers nor on the processor."""
     folder, run = bare
     vary = ("--vary", "disturbances.mass_error = normal(0, 0.02)", "--runs", "6", "--no-figures")
     flown: dict[str, list[list[tuple[object, ...]]]] = {}
     for name in levels.machine_instruction_levels():
         flown[name] = []
-        for workers in ("1", "2"):
+        for workers, seems in ("1", {}), ("2", SEEMS[name]):
             out = folder / f"{name}-{workers}"
             words = ("passage-quadrotors", *vary, "--workers", workers, "--out", str(out))
-            run("rigidfleet", "sweep", *words, RIGIDFLEET_LEVEL=name)
+            run("rigidfleet", "sweep", *words, RIGIDFLEET_LEVEL=name, **seems)
             with closing(sqlite3.connect(out / "sweep.db")) as store:
                 rows = store.execute("SELECT * FROM runs ORDER BY run")
                 wall = [column[0] for column in rows.description].index("wall")
@@ -326,6 +345,23 @@ def test_workers_fly_the_same_bits_on_a_level(bare):
         assert one == two
         assert len(one) == 6
     assert len(flown) > 0
+
+
+@linux
+@pytest.mark.long
+def test_flights_have_the_same_bits_on_a_level(bare):
+    """On one level of x86-64 a flight by the command is the same bit for bit, whatever the processor seems to be."""
+    folder, run = bare
+    for name in levels.machine_instruction_levels():
+        for mission in ("narrow-passage", "passage-quadrotors", "cube-passage", "moving-obstacles"):
+            flown = []
+            for seems in {}, SEEMS[name]:
+                out = folder / f"{name}-{mission}-{len(seems)}"
+                words = ("run", mission, "--no-figures", "--out", str(out))
+                run("rigidfleet", *words, RIGIDFLEET_LEVEL=name, **seems)
+                result = rigidfleet.Result.load(out / f"{mission}.nc")
+                flown.append([x.tobytes() for x in (result.time, result.position, result.velocity)])
+            assert flown[0] == flown[1], (name, mission)
 
 
 @pytest.mark.long

@@ -18,6 +18,7 @@ Packages that load slowly are imported only by the commands that need them.
 from __future__ import annotations
 
 import gc
+import logging
 import os
 import re
 import sys
@@ -46,6 +47,7 @@ from rigidfleet.cli import (
 )
 from rigidfleet.cli.codes import BAD_INPUT, FAILED, INTERRUPTED, PASSED
 from rigidfleet.errors import RigidfleetError
+from rigidfleet.kernel.compiler import levels
 
 __all__ = ["BAD_INPUT", "FAILED", "INTERRUPTED", "PASSED", "app", "main"]
 
@@ -87,6 +89,10 @@ def main(tokens: Sequence[str] | None = None) -> int:
         warnings.showwarning = cast("Any", console.warn)
         # The matrices are small: several threads would only wait for each other, on a busy machine for long.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        # Without a home that can be written, it would report on two lines that it needs none.
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)
+        for key, value in levels.LIBRARY_SETTINGS.get(os.environ.get(levels.KEY, ""), {}).items():
+            os.environ.setdefault(key, value)
     console.prepare_streams()
     try:
         with run.raise_interrupts() if tokens is None else nullcontext():

@@ -15,6 +15,7 @@ from rigidfleet.typing import Bools, Ints
 
 #: Folder of the shards in the folder of their sweep.
 _SHARDS = "shards"
+_DIGITS = "If only last digits differ, docs/install.md says what fixes them on all processors."
 _MOVE = "Move the wrong one out of the folder."
 
 
@@ -69,7 +70,7 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
         for row in part:
             where, same = rows.setdefault(row[0], (path, row))
             if outcome(row) != outcome(same):
-                raise ResultError(f"{path}: run {row[0]} is not as in {where}. {_MOVE}")
+                raise ResultError(f"{path}: run {row[0]} is not as in {where}. {_DIGITS} {_MOVE}")
     shards = _shard_of_runs(sweep.runs, count := common["number of shards"])
     total, flown = (np.bincount(x, minlength=count + 1) for x in (shards, shards[[*rows]]))
     if lacking := np.flatnonzero(flown < total).tolist():

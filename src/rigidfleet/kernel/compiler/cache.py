@@ -98,9 +98,9 @@ def warn_not_cached(error: OSError) -> None:
     if not warned.is_set():
         warned.set()
         warnings.warn(
-            f"the compiled flight kernel cannot be cached in {_kernel_cache_folder()}: {error.strerror or error}. Every"
-            " process compiles it again, which takes about half a minute. Set NUMBA_CACHE_DIR to a folder that only you"
-            " can write",
+            f"compiled code cannot be cached in {_kernel_cache_folder()}: {error.strerror or error}. Every process"
+            " compiles again what rigidfleet was not installed with. Set NUMBA_CACHE_DIR to a folder that only you can"
+            " write",
             RuntimeWarning,
             stacklevel=3,
         )

@@ -25,6 +25,14 @@ LEVELS = tuple(_NEEDS)
 HOST = "host"
 #: The variable of the environment that fixes the level.
 KEY = "RIGIDFLEET_LEVEL"
+#: What keeps OpenBLAS and NumPy to a level below the machine's highest, if set before they are loaded: they choose
+#: code by processor, too. NumPy passes over names that only other versions of it know.
+LIBRARY_SETTINGS = {
+    "x86-64-v3": {
+        "OPENBLAS_CORETYPE": "Haswell",
+        "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512F AVX512_SKX AVX512_ICL AVX512_SPR",
+    }
+}
 
 
 @cache

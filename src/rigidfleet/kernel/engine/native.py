@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.files import replace_atomically
+from rigidfleet.errors import RigidfleetError
 from rigidfleet.kernel.compiler.cache import (
     cache_directory,
     open_for_reading,
@@ -49,10 +50,7 @@ from rigidfleet.kernel.engine.packing import (
     pack_uncached,
 )
 from rigidfleet.kernel.measured import Measured
-from rigidfleet.kernel.problem import (
-    Problem,
-    Workspace,
-)
+from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.kernel.records import (
     IntegratorState,
     Monitor,
@@ -227,8 +225,17 @@ def _make_library(part: str, engine: Any, address_of: Callable[[str], int]) -> L
 
 
 def _load_shared_object(file: Path) -> tuple[Any, Callable[[str], int]]:
-    """Load a shared object."""
-    engine = ctypes.CDLL(str(file))
+    """Load a shared object.
+
+    Raises
+    ------
+    RigidfleetError
+        The file is damaged, or lies where no code may run.
+    """
+    try:
+        engine = ctypes.CDLL(str(file))
+    except OSError as error:  # whose text begins with the file
+        raise RigidfleetError(f"{error}. Install rigidfleet again.") from None
     return engine, lambda name: ctypes.cast(engine[name], ctypes.c_void_p).value or 0
 
 
