@@ -430,6 +430,18 @@ def test_some_leave_and_the_others_fly_on(agents: list[int], T: float) -> None:
             a, b = (np.interp(t, x.time, x.position[:, i, q]) for x in (plain, result))
             assert np.abs(a - b).max() < 1e-2
     assert np.abs(result.position[-1] - plain.position[-1]).max() < 0.02
+    # What those who fly on meet fails the check, as it would without the order.
+    late = plain.time[-1] - 4.0
+    i, k = others[0], int(np.searchsorted(plain.time, late))
+    ball = {
+        "kind": "sphere",
+        "name": "ball",
+        "centre": plain.position[k, i].tolist(),
+        "radius": 0.2,
+    }
+    data = mission.to_dict()
+    ahead = rf.check(Mission.from_dict(data | {"obstacles": [*data["obstacles"], ball]}))
+    assert "hits 'ball'" in str([x.text for x in ahead.remarks if x.level == "fails"])
     abort = aborts_of(mission).abort_at(T)
     i, j = np.triu_indices(12, 1)
     r = abort.positions_at(np.linspace(abort.begins, abort.rest_time, 3000))

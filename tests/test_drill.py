@@ -583,8 +583,8 @@ def test_a_drill_reads_files_as_assess_does(tmp_path, capsys, monkeypatch):
     assert "the gap: `--gaps bridge`" in outcome.err
     code, outcome = drill("plain.csv", *gaps)
     assert code == 0, outcome.err
-    assert "warning: no unit is said: times as s, places as m." in outcome.err
-    assert "warning: 'a' has no sample between 1 and 4 s" in outcome.err
+    assert "warning: plain.csv: no unit is said: times as s, places as m." in outcome.err
+    assert "warning: plain.csv: 'a' has no sample between 1 and 4 s" in outcome.err
     expected = json.loads(outcome.out)
     code, outcome = drill("turned.csv", *gaps, *units, "--axes", "ned")
     assert code == 0, outcome.err

@@ -1,5 +1,6 @@
 """Sweeps: what varies, the same rows however they are flown, the store, the summary, the command."""
 
+import errno
 import io
 import json
 import logging
@@ -860,7 +861,7 @@ def test_an_executor_that_dies_is_a_sentence(flown, tmp_path, monkeypatch, capsy
     "fault",
     [
         MemoryError("no room"),
-        OSError("no library"),
+        OSError(errno.EMFILE, "too many open files"),
         RuntimeError("can't start new thread"),
         RigidfleetError("RIGIDFLEET_LEVEL: no"),
     ],
@@ -876,11 +877,23 @@ def test_a_fault_of_the_machine_is_no_row(flown, fault, tmp_path, monkeypatch):
             short.setattr(f"rigidfleet.{place}", fail)
             with pytest.raises(RigidfleetError, match=re.escape(str(fault))):
                 fly(sweep(), tmp_path, workers=1)
-            words = rf"a worker failed: .*{fault}\. .*: 0 of 20 runs are saved; the same command"
+            words = rf"a worker failed: .*{re.escape(str(fault))}\. .*: 0 of 20 runs are saved; the same command"
             with pytest.raises(RigidfleetError, match=words):
                 fly(sweep(), tmp_path, pool=pool, workers=1)
     assert not len(read(tmp_path).run)
     assert numbers(fly(sweep(), tmp_path, workers=1)) == numbers(flown)
+
+
+def test_a_file_that_a_run_lacks_fails_that_run(tmp_path, monkeypatch):
+    """An error of the system that is no lack of the machine is the outcome of its run: all rows are there."""
+
+    def fail(*_: Any) -> Any:
+        raise FileNotFoundError(errno.ENOENT, "no gains", "gains.csv")
+
+    monkeypatch.setattr("rigidfleet.assessment.assess", fail)
+    table = fly(sweep(), tmp_path, workers=1)
+    assert len(table.run) == 20
+    assert set(table.reason) == {"error"}
 
 
 def test_a_worker_that_cannot_run_the_level_says_so(tmp_path, monkeypatch):

@@ -210,6 +210,27 @@ def judged_as_meant(read, vehicles=2):
         np.testing.assert_allclose(curve.at(t)[:, :3], [place(x, i) for x in t.tolist()], atol=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("names", "k", "fields"),
+    [
+        ("t_ms,x,y,z", 0, "0 33.333 66.667 100 133.333 166.667 200"),
+        ("t,x,y,z,yaw_deg", 4, "0 51.429 102.857 154.286 205.714 257.143 308.571 360"),
+        ("t,x_ft,y_ft,z_ft", 1, "10 13.123 16.404"),
+        ("t,x_mm,y_mm,z_mm", 1, "10 13.123 16.404"),
+    ],
+)
+def test_decimals_beside_whole_numbers_are_decimals(names, k, fields, tmp_path):
+    """Of a column that leaps less with its points as decimals, these are no marks between thousands."""
+    rows = []
+    for i, field in enumerate(fields.split()):
+        row = [str(i), "1", "1", "1", "1"][: names.count(",") + 1]
+        row[k] = field
+        rows.append(",".join(row))
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join([names, *rows]))
+    read_trajectories(path)
+
+
 @pytest.mark.parametrize("kind", SAME)
 def test_tables_are_read_as_meant(kind, tmp_path):
     """Names, units, separators, comments, dates: all give the same two vehicles, and no doubt."""

@@ -25,6 +25,8 @@ _CONTROL = re.compile(r"[^\t\n\r\x20-\x7e\xa0-\U0010ffff]")
 _REMARK = re.compile(r"\s+#(?![0-9a-fA-F]{6}\b).*")
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}[.,]\d{3}")
+#: Units of which there may be thousands.
+_SMALL = {1e-3, 1e-6, 1e-9}
 _HUNDREDS = re.compile(r"[-+]?[1-9]\d{0,2}")
 _TEXT = np.dtypes.StringDType()
 #: Words for units and axes in lines that are not read, and for numbers that are not there.
@@ -196,11 +198,16 @@ class TextTable:
         factors, values = [self.factor(k) for k in which], np.zeros((len(self.lines), len(which)))
         faults = {fault.line: fault for fault in self._faults}
         odd = [i for i, k in enumerate(which) if not _parse_numbers(self.columns[k], values[:, i])]
-        for k in (k for k, factor in zip(which, factors, strict=True) if factor < 1.0):
-            fields = {x for x in self.columns[k].tolist() if not _BLANK.fullmatch(x)}
+        for k in (k for k, factor in zip(which, factors, strict=True) if factor in _SMALL):
+            fields = [
+                x for x in self.columns[k].tolist() if is_number(x) and not _BLANK.fullmatch(x)
+            ]
             marked = [x for x in fields if "." in x or "," in x]
             whole = any(map(_HUNDREDS.fullmatch, fields))
-            if marked and whole and all(map(_THOUSANDS.fullmatch, marked)):
+            thousands = marked and whole and all(map(_THOUSANDS.fullmatch, marked))
+            # Decimals that end in 0 would not be beside whole numbers.
+            trailing = any(x.endswith("0") for x in marked)
+            if thousands and (trailing or _leap(fields, "") <= _leap(fields, ".")):
                 why = f"{self.names[k]} is {min(marked)}, and others have no decimals: are these thousands?"
                 raise fault(why, "Write no marks between thousands, or decimals everywhere")
         if odd and not self.decimal:
@@ -228,6 +235,12 @@ class TextTable:
         if faults:
             raise ContentError(*(faults[line] for line in sorted(faults)))
         return values * factors
+
+
+def _leap(fields: Sequence[str], mark: str) -> float:
+    """The greatest change from one number to the next, over all changes, where a mark stands for a point or a comma."""
+    change = np.abs(np.diff([float(re.sub("[.,]", mark, x)) for x in fields]))
+    return float(change.max(initial=0.0) / max(np.ptp(np.cumsum([0.0, *change])), 1e-300))
 
 
 def notes_on_units(lines: Iterable[str]) -> list[str]:

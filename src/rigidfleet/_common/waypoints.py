@@ -9,3 +9,5 @@ UNITS = {"position": "m", "velocity": "m/s", "attitude": "deg", "rates": "deg/s"
 #: where a formation has no tolerance of its own. A shape that is reached has errors below 1e-3; one folded another
 #: way, of some tenths.
 SHAPE_TOLERANCE = 0.01
+#: Share of a limit, or of a unit, by which rounding may exceed it.
+LEEWAY = 1e-9

@@ -11,13 +11,12 @@ import numpy as np
 
 from rigidfleet._common.quantities import MOTIONS, PLACES, QUANTITIES, Quantity, quantity
 from rigidfleet._common.text import agent_names, percent_text
-from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
+from rigidfleet._common.waypoints import LEEWAY, UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.assessment.avoidance import guarantee_checks
 from rigidfleet.assessment.fits import is_rigid
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import (
     FLIPPED,
-    LEEWAY,
     TOUCH_DOWN,
     CheckResult,
     Extreme,

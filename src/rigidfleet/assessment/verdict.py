@@ -21,10 +21,8 @@ from rigidfleet._common.facts import (
 from rigidfleet._common.plain import to_json_data
 from rigidfleet._common.quantities import QUANTITIES, Quantity, quantity
 from rigidfleet._common.text import all_hold_in_words
-from rigidfleet._common.waypoints import SHAPE_TOLERANCE, UNITS, WAYPOINT_TOLERANCE
+from rigidfleet._common.waypoints import LEEWAY, SHAPE_TOLERANCE, UNITS, WAYPOINT_TOLERANCE
 
-#: Share of a limit, or of a unit if this is more, by which rounding may exceed it.
-LEEWAY = 1e-9
 #: Greatest speed downwards at touch-down [m/s]: the default of ArduPilot's LAND_SPEED.
 TOUCH_DOWN = 0.5
 #: Angle beyond which a plane's normal, or a line's direction, counts as flipped [deg].
@@ -106,8 +104,17 @@ class CheckResult:
             when, who = self.first.when, f"first {self.first.who}"
         level = "fails" if not self.passed else "ok" if self.judged else ""
         level = "undecided" if self.undecided else level
-        bound = self.limit, self.at_least
-        return Fact(self.name, self.worst, self.unit, *bound, when, who, level, self.interval)
+        return Fact(
+            self.name,
+            self.worst,
+            self.unit,
+            self.limit,
+            self.at_least,
+            when,
+            who,
+            level,
+            self.interval,
+        )
 
     def fill(self, words: str) -> str:
         """Words with {worst}, {limit} and {who} put in."""
@@ -308,10 +315,21 @@ class Verdict(Shown):
     def to_dict(self) -> dict[str, Any]:
         """The verdict as plain data that JSON can hold; None for what does not apply."""
         data = {
-            "mission": self.mission, "title": self.title, "passed": self.passed, "summary": self.summary,
-            "tolerances": {"shape": SHAPE_TOLERANCE, "waypoint": WAYPOINT_TOLERANCE, "flip": FLIPPED},
-            "checks": self.checks, "notes": self.notes, "read": self.read, "worst": self.worst, "phases": self.phases,
-        }  # fmt: skip
+            "mission": self.mission,
+            "title": self.title,
+            "passed": self.passed,
+            "summary": self.summary,
+            "tolerances": {
+                "shape": SHAPE_TOLERANCE,
+                "waypoint": WAYPOINT_TOLERANCE,
+                "flip": FLIPPED,
+            },
+            "checks": self.checks,
+            "notes": self.notes,
+            "read": self.read,
+            "worst": self.worst,
+            "phases": self.phases,
+        }
         doubt = {} if self.doubt is None else {"verdict": self.word, "doubt": self.doubt}
         return to_json_data(data | doubt)
 

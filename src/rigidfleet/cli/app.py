@@ -93,6 +93,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         logging.getLogger("matplotlib").setLevel(logging.ERROR)
         for key, value in levels.LIBRARY_SETTINGS.get(os.environ.get(levels.KEY, ""), {}).items():
             os.environ.setdefault(key, value)
+            warnings.filterwarnings("ignore", f"(?s).*{key}", ImportWarning)
     console.prepare_streams()
     try:
         with run.raise_interrupts() if tokens is None else nullcontext():

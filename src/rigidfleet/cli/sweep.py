@@ -206,13 +206,16 @@ def _sweep_and_folder(
     from rigidfleet.sweep.definition import is_sweep_file
 
     here = Path(what)
-    if stored := (shards.shard_folders(here) if shard else []) or [here] * store.is_store(here):
+    stored = [*shards.readable_sweeps(here)] if shard else []
+    if not stored and store.is_store(here):
+        stored = [store.read(here).sweep]
+    if stored:
         if vary or out is not None or of_others or any(x is not None for x in keys.values()):
             raise RigidfleetError(
                 f"{what}: is the folder of a sweep, whose definition cannot change. Remove all options that define one:"
                 " only --runs may grow."
             )
-        definition = max((store.read(x).sweep for x in stored), key=lambda sweep: sweep.runs)
+        definition = max(stored, key=lambda sweep: sweep.runs)
         definition.runs = definition.runs if runs is None else runs
         return definition, here
     named = what in mission_names()
@@ -261,6 +264,6 @@ def _mission_of_trajectories(
         raise RigidfleetError(f"{path}: {words}")
     read = read_trajectories(path, spans="stand", **how)
     for note in read.notes:
-        console.warn(f"{note}.")
+        console.warn(f"{path}: {note}.")
     own = {"separation": separation, "radius": radius, "name": flight_name(path)}
     return result_of_trajectories(read, **own).mission

@@ -129,7 +129,9 @@ def _times_and_epoch(table: TextTable, notes: list[str]) -> tuple[Floats, int | 
     number = is_number(fields[0])
     if not table.lines.size or (number and abs(float(fields[0].replace(",", "."))) < _DATES[0]):
         return table.numbers_of_columns(columns)[:, 0], None
-    ticks, _ = [], number and table.factor(columns[0])
+    if number:
+        table.factor(columns[0])  # its unit is noted
+    ticks = []
     for line, field in zip(table.lines.tolist(), fields, strict=True):
         if (tick := _parse_number_or_date(field)) is None:
             why = f"the time {table.names[columns[0]]} is {field[:40] or 'empty'}, neither a finite number nor a date"

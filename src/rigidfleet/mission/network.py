@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from rigidfleet._common.renamed import RENAMED
 from rigidfleet.mission.losses import agent_number_rules, loss_time_rules
 from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.schema import Network
@@ -18,7 +17,7 @@ def with_network(data: dict[str, Any]) -> dict[str, Any]:
     """
     match data:
         case {"disturbances": {"links": dict(links), **others}} if "network" not in data:
-            network = {RENAMED.get(key, key): value for key, value in links.items()}
+            network = {{"dropped": "loss"}.get(key, key): value for key, value in links.items()}
             return data | {"disturbances": others, "network": network}
     return data
 

@@ -95,6 +95,13 @@ _UP, _ABOVE = np.array([0.0, 0.0, 1.0]), np.array([1.0, 1.0, 0.0])
 _APART_FOR_EVER = Certificate(math.inf, 0.0, (0, 0), "closed form")
 
 
+#: When something happens in a step, in words; in others, on the way by that name.
+_ON_STEP = {
+    "slow down": "while slowing down", "leave": "on leaving", "apart": "while moving apart",
+    "over the places": "on the way to the places",
+}  # fmt: skip
+
+
 class Step(NamedTuple):
     """One step of an abort, from its beginning.
 
@@ -426,9 +433,7 @@ class Aborts:
         along = step.path is not None
         astray = 0.0 if along else 0.5 * step.off  # how far each may be off its way in flight
         way = step.way
-        on = {"slow down": "while slowing down", "leave": "on leaving"}.get(
-            step.name, f"on the way {step.name}"
-        )
+        on = _ON_STEP.get(step.name, f"on the way {step.name}")
         if not along and (apart := step.least.separation - step.off) < max(self.need, 1e-6):
             # On their pads vehicles may be nearer.
             both, pads = way.at(np.zeros(1))[0, list(step.least.agents), 2], limits.separation_altitude  # fmt: skip
@@ -550,7 +555,7 @@ class Aborts:
         p, q = r[left], goal[left]
         if way == "to any place":
             metric, goal = downwash_metric(_UP, self.below / self.apart), goal.copy()
-            q = self._places_clear_of_wrecks(r, q)
+            q = self._places_clear_of_wrecks(r, q, off)
             goal[left] = q[assign_slots(p, q, turn=np.eye(3), metric=metric).order]
         if way == "by levels":
             height = _altitude_levels(self.apart + off, p, q) * (self.below + off)
@@ -564,11 +569,11 @@ class Aborts:
         above[left] += rise * _UP
         return [*stops, ("over the places", r, above), ("down", above, goal)]
 
-    def _places_clear_of_wrecks(self, r: Floats, own: Floats) -> Floats:
+    def _places_clear_of_wrecks(self, r: Floats, own: Floats, off: float) -> Floats:
         """The own places (n, 3) of those left; where a lost vehicle lies on one, that of a lost one if it is free."""
         if not self.wrecked.size:
             return own
-        every = self.landing_places(r)
+        every = self.landing_places(r, off)
         near = proximity.obstacle_clearances(every, self.radius, self.wrecks, _EVER)[0] < _PACE
         own, spare, taken = own.copy(), every[self.lost & ~near], np.flatnonzero(near[self.left])
         count = min(len(spare), len(taken))
@@ -639,9 +644,9 @@ class Aborts:
         begins, end = ordered + self.options.reaction, self.plan_end
         who = self._aborts_of_leavers.left
         order = np.concatenate([who, np.setdiff1d(self.left, who)])
-        problem = "there is no time left"
+        problem = "there is no time left" if who.size else "those who would leave are lost"
         plan = self.step_by_clock("", _path_clock(begins, max(end - begins, SHORTEST), _ON)).least
-        for waits in np.arange(0.0, end - begins, self.options.step).tolist():
+        for waits in np.arange(0.0, end - begins, self.options.step).tolist() if who.size else ():
             alone = self._aborts_of_leavers._abort_of_all(ordered + waits)
             if alone.home.reason:
                 problem = alone.home.reason

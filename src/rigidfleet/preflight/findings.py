@@ -43,8 +43,6 @@ _MOST_NAMES = 6
 DENSE = 600
 #: Number of agents beyond which tracked slots are those of a show, whose edges are not explained.
 _MANY = 12
-#: A limit is exceeded only by more than this rounding error.
-LEEWAY = 1e-9
 
 #: Quantities whose worst planned values are shown without a limit, too.
 WORST_SHOWN = ("separation", "speed", "vertical_speed", "thrust")

@@ -31,6 +31,8 @@ def parts_before_and_after_loss(
 ) -> tuple[list[PlannedPhase], list[PlannedPhase]]:
     """Planned phases up to when the flight leaves its plan, and those after it, which are not flown."""
     first = mission.abandons_at
+    if mission.aborts and mission.aborting.agents:  # the others fly it to its end
+        return list(planned), []
     flown = [x for x in planned if x.leg.end <= first]
     rest = [x for x in planned if x.leg.start >= first]
     if cut := [x for x in planned if x.leg.start < first < x.leg.end]:

@@ -8,13 +8,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet._common.quantities import PLACES, QUANTITIES
+from rigidfleet._common.waypoints import LEEWAY
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Mission, Obstacle
 from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
 from rigidfleet.mission.obstacles import Box, Ground
 from rigidfleet.planning.clearance import CLEARANCE_ACCURACY, clearance_to, speed_bounds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
-from rigidfleet.preflight.findings import LEEWAY, Preflight, Remark, names_with_verb
+from rigidfleet.preflight.findings import Preflight, Remark, names_with_verb
 from rigidfleet.solids.records import swept_extent
 from rigidfleet.typing import Floats
 

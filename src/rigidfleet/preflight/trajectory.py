@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, Quantity
 from rigidfleet._common.text import agent_names
-from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
+from rigidfleet._common.waypoints import LEEWAY, UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -24,7 +24,7 @@ from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.reference import pose_at
 from rigidfleet.planning.vehicles import drag_and_lift
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
-from rigidfleet.preflight.findings import DENSE, LEEWAY, WORST_SHOWN, Disturbed, Preflight, Remark
+from rigidfleet.preflight.findings import DENSE, WORST_SHOWN, Disturbed, Preflight, Remark
 from rigidfleet.rigidity import jacobian
 from rigidfleet.typing import Floats
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 from collections.abc import Callable, Sequence
 from time import perf_counter
@@ -22,6 +23,16 @@ if TYPE_CHECKING:
 
 #: Number of consecutive runs in a group. The first run of a group is a multiple of it.
 GROUP = 8
+#: What a machine lacks where it answers with one of these: memory, files that may be open, room on a disk. Of other
+#: errors of the system, such as a file of a controller that is not there, the run is to blame.
+_LACKS = {
+    errno.ENOMEM,
+    errno.EAGAIN,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ENOSPC,
+    errno.EIO,
+}
 
 
 def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
@@ -124,7 +135,7 @@ def _value_or_error(job: Callable[[], Any]) -> Any:
         if isinstance(before, KeyboardInterrupt) or type(error) is RigidfleetError:
             raise  # Ctrl-C, turned into another exception by the compiler; or a sentence that names the machine's fault
         out = (isinstance(x, MemoryError) or "start new thread" in str(x) for x in (error, before))
-        if isinstance(error, OSError) or any(out):
+        if (isinstance(error, OSError) and error.errno in _LACKS) or any(out):
             raise RigidfleetError(f"{type(error).__name__}: {error}") from error
         return error
 

@@ -108,7 +108,7 @@ def fly(
     """
     if not isinstance(pool, Executor | None):
         raise wrong_type("an Executor of concurrent.futures as pool", pool)
-    if workers is not None and (not isinstance(workers, int) or workers < 1):
+    if workers is not None and (not isinstance(workers, int | np.integer) or workers < 1):
         raise wrong_type("a whole number of workers, 1 or more", workers)
     if pool is not None and cluster is not None:
         raise RigidfleetError("pool and cluster exclude each other: use one of them.")

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rigidfleet.errors import ResultError, RigidfleetError
+from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.run import GROUP
 from rigidfleet.sweep.store import Store, Table, diff_names, is_store, outcome, read, store_contents
 from rigidfleet.typing import Bools, Ints
@@ -41,6 +44,13 @@ def shard_folder(folder: Path, shard: str) -> Path:
 def shard_folders(folder: Path) -> list[Path]:
     """Folders of the shards that are in the folder of a sweep."""
     return sorted(path for path in folder.glob(f"{_SHARDS}/*") if is_store(path))
+
+
+def readable_sweeps(folder: Path) -> Iterator[Sweep]:
+    """The sweeps of the shards in a folder of a sweep; those that cannot be read are left out."""
+    for path in sorted(folder.glob(f"{_SHARDS}/*")):
+        with suppress(ResultError):
+            yield read(path).sweep
 
 
 def merge(folder: str | Path, *, replace: bool = False) -> Table:

@@ -26,7 +26,8 @@ HOST = "host"
 #: The variable of the environment that fixes the level.
 KEY = "RIGIDFLEET_LEVEL"
 #: What keeps OpenBLAS and NumPy to a level below the machine's highest, if set before they are loaded: they choose
-#: code by processor, too. NumPy passes over names that only other versions of it know.
+#: code by processor, too. NumPy passes over names that only other
+#: versions of it know, with a warning.
 LIBRARY_SETTINGS = {
     "x86-64-v3": {
         "OPENBLAS_CORETYPE": "Haswell",
