@@ -1,25 +1,19 @@
 """A made-up limit of constraint forces is judged or refused, and has its metric, row, line in a figure, and key."""
 
-import importlib
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.text import Text
 
 import rigidfleet as rf
-from rigidfleet import plotting
 from rigidfleet.assessment import safety
 from rigidfleet.cli import assess as assess_command
 from rigidfleet.errors import ResultError
-from rigidfleet.mission import json_schema
-from rigidfleet.reporting import report_page
-from rigidfleet.sweep import METRICS
 from rigidfleet.sweep.metrics import measure_metrics
 
-sys.path.insert(0, "docs")
-tables = importlib.import_module("tables")  # of the patched copy
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from limit_readers import assert_limit_is_shown
 
 base = rf.load_mission("establish-triangle").to_dict()
 greatest = np.linalg.norm(rf.simulate("establish-triangle").constraint_force, axis=2).max()
@@ -49,13 +43,5 @@ with pytest.raises(ResultError, match=r"limits\.constraint_force: is judged by f
 verdict = rf.assess(rf.trajectories(time, places, mission=limited))
 assert not [c for c in verdict.checks if c.check == "constraint_force"]
 
-(picture,) = plotting.plot(result, names=["constraint_force"])
-drawn = [text.get_text() for text in picture.findobj(Text)]
-assert any(
-    f"limit {0.5 * greatest:g} N" in text.replace("\N{NO-BREAK SPACE}", " ") for text in drawn
-)
-assert report_page(result).count('class="words">constraint force') == 2
-assert METRICS["constraint_force"].unit == "N"
-assert json_schema()["$defs"]["Limits"]["properties"]["constraint_force"]["description"]
-assert "| `constraint_force` | number |" in tables.render(Path("docs/missions.md").read_text())
+assert_limit_is_shown(result, "constraint_force", "N", 0.5 * greatest, "constraint_force")
 print("done")

@@ -1,26 +1,20 @@
 """A made-up quantity of positions with a limit is in verdict, check, metrics, report, safety page, figures and help."""
 
-import importlib
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.text import Text
 
 import rigidfleet as rf
-from rigidfleet import plotting
 from rigidfleet.assessment import safety
 from rigidfleet.cli import assess as assess_command
 from rigidfleet.foreign.curves import ASSUMED, Trajectories, curve_through_samples
-from rigidfleet.mission import json_schema
-from rigidfleet.reporting import report_page
 from rigidfleet.simulation.as_logged import Doubts, judge_log
-from rigidfleet.sweep import METRICS
 from rigidfleet.sweep.metrics import measure_metrics
 
-sys.path.insert(0, "docs")
-tables = importlib.import_module("tables")  # of the patched copy
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from limit_readers import assert_limit_is_shown
 
 base = rf.load_mission("establish-triangle").to_dict()
 r = rf.simulate("establish-triangle").position
@@ -60,13 +54,5 @@ low, high = verdict.by_name["spread"].interval or (np.inf, np.inf)
 assert low < np.sqrt(12.0) < high < np.sqrt(12.0) + 0.05
 
 assert "spread" in assess_command._LIMITS
-(picture,) = plotting.plot(result, names=["motion"])
-drawn = [text.get_text() for text in picture.findobj(Text)]
-assert any(
-    f"limit {0.5 * greatest:g} m" in text.replace("\N{NO-BREAK SPACE}", " ") for text in drawn
-)
-assert report_page(result).count('class="words">spread') == 2
-assert METRICS["spread"].unit == "m"
-assert json_schema()["$defs"]["Limits"]["properties"]["spread"]["description"]
-assert "| `spread` | number |" in tables.render(Path("docs/missions.md").read_text())
+assert_limit_is_shown(result, "spread", "m", 0.5 * greatest, "motion")
 print("done")

@@ -240,7 +240,7 @@ class TextTable:
 def _leap(fields: Sequence[str], mark: str) -> float:
     """The greatest change from one number to the next, over all changes, where a mark stands for a point or a comma."""
     change = np.abs(np.diff([float(re.sub("[.,]", mark, x)) for x in fields]))
-    return float(change.max(initial=0.0) / max(np.ptp(np.cumsum([0.0, *change])), 1e-300))
+    return float(change.max(initial=0.0) / max(change.sum(), 1e-300))
 
 
 def notes_on_units(lines: Iterable[str]) -> list[str]:

@@ -208,7 +208,7 @@ def _sweep_and_folder(
     here = Path(what)
     stored = [*shards.readable_sweeps(here)] if shard else []
     if not stored and store.is_store(here):
-        stored = [store.read(here).sweep]
+        stored = [store.read_definition(here)]
     if stored:
         if vary or out is not None or of_others or any(x is not None for x in keys.values()):
             raise RigidfleetError(

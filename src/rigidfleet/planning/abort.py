@@ -532,7 +532,8 @@ class Aborts:
         for way in ("to any place",) * (2 - self.stands) if self.to == "any" else own:
             steps: list[Step] = []
             problem, t = "", begin
-            goal[left] = self.landing_places(r, off)[left]
+            if off:
+                goal[left] = self.landing_places(r, off)[left]
             for name, a, b in self._landing_step_ends(way, r, goal, off):
                 if np.abs(b - a).max() > 1e-9:
                     steps.append(self._straight_step(name, a, b))

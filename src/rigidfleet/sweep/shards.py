@@ -13,7 +13,16 @@ import numpy as np
 from rigidfleet.errors import ResultError, RigidfleetError
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.run import GROUP
-from rigidfleet.sweep.store import Store, Table, diff_names, is_store, outcome, read, store_contents
+from rigidfleet.sweep.store import (
+    Store,
+    Table,
+    diff_names,
+    is_store,
+    outcome,
+    read,
+    read_definition,
+    store_contents,
+)
 from rigidfleet.typing import Bools, Ints
 
 #: Folder of the shards in the folder of their sweep.
@@ -50,7 +59,7 @@ def readable_sweeps(folder: Path) -> Iterator[Sweep]:
     """The sweeps of the shards in a folder of a sweep; those that cannot be read are left out."""
     for path in sorted(folder.glob(f"{_SHARDS}/*")):
         with suppress(ResultError):
-            yield read(path).sweep
+            yield read_definition(path)
 
 
 def merge(folder: str | Path, *, replace: bool = False) -> Table:

@@ -216,6 +216,30 @@ def read(folder: str | Path) -> Table:
     )
 
 
+@contextmanager
+def _open_store(folder: Path) -> Generator[tuple[sqlite3.Connection, dict[str, str], Sweep]]:
+    """The database of a folder, what it says of the sweep, and the sweep; errors are ResultErrors."""
+    if not is_store(folder):
+        raise ResultError(f"{folder}: contains no sweep. `rigidfleet sweep` creates one.")
+    path = folder / FILE
+    with _as_result_errors(path), closing(sqlite3.connect(path)) as db:
+        _check_format(db, folder)
+        entries = dict(db.execute("SELECT key, value FROM sweep"))
+        yield db, entries, Sweep.from_json(entries["sweep"])
+
+
+def read_definition(folder: Path) -> Sweep:
+    """The sweep of a folder, without its rows.
+
+    Raises
+    ------
+    ResultError
+        The folder does not contain a sweep.
+    """
+    with _open_store(folder) as (_, _, sweep):
+        return sweep
+
+
 def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any, ...]]]:
     """Sweep of a folder, what all shards of one sweep have in common, and the rows, in the order of the columns.
 
@@ -224,13 +248,7 @@ def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any,
     ResultError
         The folder does not contain a sweep.
     """
-    path = folder / FILE
-    if not is_store(folder):
-        raise ResultError(f"{folder}: contains no sweep. `rigidfleet sweep` creates one.")
-    with _as_result_errors(path), closing(sqlite3.connect(path)) as db:
-        _check_format(db, folder)
-        entries = dict(db.execute("SELECT key, value FROM sweep"))
-        sweep = Sweep.from_json(entries["sweep"])
+    with _open_store(folder) as (db, entries, sweep):
         common = {"number of shards": int(entries.get("shard", "").partition("/")[2] or 1)}
         known = _column_names(db)
         names = ", ".join(f'"{name}"' if name in known else "NULL" for name in _COLUMNS)
