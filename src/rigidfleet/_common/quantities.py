@@ -124,7 +124,8 @@ def _distance_beyond_geofence(mission: Any, r: Any, _: Any) -> Any:
 
     fence = mission.limits.geofence
     low, high = (np.nan, np.nan) if fence is None else (fence.min, fence.max)
-    return np.maximum(low - r, r - high).max(axis=2)
+    beyond = np.maximum(low - r, r - high)
+    return np.maximum(np.maximum(beyond[..., 0], beyond[..., 1]), beyond[..., 2])
 
 
 #: Quantities in the order in which verdicts and pages have them.

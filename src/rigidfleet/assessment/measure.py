@@ -222,7 +222,7 @@ class Measurements:
                     f"its {name} is up to {value(worst, unit)} off the value from its own samples"
                 )
                 yield words, float(time[k])
-        ranks = {name: self.worst_ranks(name) for name in _SLACK}
+        ranks = {name: self.worst_ranks(name) for name in _SLACK if name in self.names_recorded}
         for index, phase in enumerate(result.phases):
             part, extremes = self.parts[index], phase.extremes
             if part.stop > part.start and extremes:
@@ -230,11 +230,11 @@ class Measurements:
                 if name := next(lacking, ""):
                     words = f"it lacks the worst '{name}' of phase '{phase.name}' between samples"
                     yield words, float(time[part.start])
-            for name, share in _SLACK.items():
-                x, rank = extremes.get(name), ranks[name][index]
+            for name, by_phase in ranks.items():
+                x, rank = extremes.get(name), by_phase[index]
                 if x is None or rank == -math.inf:
                     continue
-                slack = rounding + share * abs(rank)
+                slack = rounding + _SLACK[name] * abs(rank)
                 if rank > quantity(name).rank(x.value) + slack or not (
                     phase.t_start - 1e-9 <= x.time <= phase.t_end + 1e-9
                 ):
