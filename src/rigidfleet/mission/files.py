@@ -31,17 +31,13 @@ NOT_A_FILE = "is read only with a mission file, as its path is relative to that"
 
 
 class _Named(NamedTuple):
-    """A file that a mission names: the table and key that do, the key of its numbers, and who reads them.
-
-    It may be a ``folder`` of files, one a vehicle.
-    """
+    """A file that a mission names: the table and key that do, the key of its numbers, and who reads them."""
 
     table: dict[str, Any]
     key: str
     becomes: str
     where: str
     read: Callable[[bytes, str], Content]
-    folder: bool = False
 
 
 class Content(NamedTuple):
@@ -102,7 +98,7 @@ def notes_on_files(text: str) -> list[str]:
 
 
 def _names_of_files(path: Path, named: _Named) -> list[str]:
-    """Names of the files of a name: itself, or those in a folder.
+    """Names of the files of a name: itself, or those in a folder of trajectories, one a vehicle.
 
     Raises
     ------
@@ -111,7 +107,7 @@ def _names_of_files(path: Path, named: _Named) -> list[str]:
     """
     name = named.table[named.key]
     place = _path_in_folder(path, named.where, name)
-    if not named.folder or not place.is_dir():
+    if named.becomes != "trajectories" or not place.is_dir():
         return [name]
     from rigidfleet.foreign.files import groups_of_files
 
@@ -134,7 +130,7 @@ def _entries_with_files(data: dict[str, Any]) -> Iterator[_Named]:
     for k, phase in _tables_with_file(phases, "follow", "trajectories"):
         said = {key: phase[key] for key in ("units", "axes") if isinstance(phase.get(key), str)}
         read = partial(_read_trajectories, yaw=phase.get("yaw") == "file", said=said)
-        yield _Named(phase, "file", "trajectories", f"phases[{k}].file", read, True)
+        yield _Named(phase, "file", "trajectories", f"phases[{k}].file", read)
     for name, form in forms.items() if isinstance(forms, dict) else ():
         if isinstance(form, dict) and isinstance(form.get("slots"), str):
             yield _Named(form, "slots", "slots", f"formations.{name}.slots", _read_points)

@@ -9,7 +9,6 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet.mission.findings import Keys, suggest
-from rigidfleet.mission.formations import has_no_findings
 from rigidfleet.mission.kinds import AnyPhase, seconds
 from rigidfleet.mission.obstacles import is_ground
 from rigidfleet.mission.phases import named_agent_rules
@@ -162,7 +161,7 @@ def _level_formation_rules(m: Draft, d: Disturbances, n: int, first: float) -> B
             remedy = suggest(name, forms) or f"formations: {', '.join(forms)}"
             yield Breach(where, "there is no such formation", remedy)
             return
-        slots = forms[name].slot_array(n) if has_no_findings(m, name) else None
+        slots = forms[name].slot_array(n) if m.is_valid(("formations",), name) else None
         words = "it has no slots to track" if slots is None else _height_spread_text(slots, radius)
         if words:
             remedy = "name a level formation, such as a line or a square"

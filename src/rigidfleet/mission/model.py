@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from copy import copy
-from functools import cached_property, lru_cache, wraps
+from functools import cached_property, wraps
 from hashlib import sha256
 from typing import Any, Literal, NamedTuple, Self, TypeVar
 
@@ -479,7 +479,9 @@ class Mission(Contents, Shown):
             slots, masses = slots[left], masses[left]
         if not len(edges) or min(len(edges), 3 * len(masses)) > _DENSE:
             return _DAMPING[1]
-        return _automatic_damping(slots.tobytes(), edges.tobytes(), masses.tobytes())
+        J = constraint_jacobian.jacobian(slots[None], edges)
+        (singular,) = constraint_jacobian.least_singular(J, masses)  # of mbar J M^-1 J^T
+        return float(np.clip(singular**2 / 4, *_DAMPING))
 
     @property
     def latest_end(self) -> float:
@@ -602,8 +604,6 @@ class Mission(Contents, Shown):
         pairs, times = self.links_lost
         n = self.n_agents
         lost = pairs[times < t]
-        if not len(lost):
-            return np.ones(len(edges), dtype=np.bool_)
         return ~np.isin(edges[:, 0] * n + edges[:, 1], lost[:, 0] * n + lost[:, 1])
 
     @cached_property
@@ -650,17 +650,3 @@ class Mission(Contents, Shown):
     def on_loss(self) -> Literal["continue", "hold", "land", "abort"]:
         """What the others do when a vehicle or link is lost."""
         return self.all_disturbances.on_loss
-
-
-@lru_cache(64)
-def _automatic_damping(slots: bytes, edges: bytes, masses: bytes) -> float:
-    """Damping "auto" of a formation held: slots (N, 3) [m], edges (m, 2) and masses (N,) [kg].
-
-    All runs of a sweep ask for the same: it would be a tenth of a short flight.
-    """
-    r, pairs = np.frombuffer(slots).reshape(1, -1, 3), np.frombuffer(edges, np.int64).reshape(-1, 2)
-    J = constraint_jacobian.jacobian(r, pairs)
-    least, most = _DAMPING
-    (singular,) = constraint_jacobian.least_singular(J, np.frombuffer(masses))  # of mbar J M^-1 J^T
-    w = float(singular) ** 2
-    return min(max(w / 4, least), most)

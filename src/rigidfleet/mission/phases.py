@@ -17,7 +17,6 @@ from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys, suggest
-from rigidfleet.mission.formations import has_no_findings
 from rigidfleet.mission.kinds import (
     ANGLES,
     KINDS,
@@ -117,7 +116,7 @@ def _phase_name_rules(phases: Written) -> Breaches:
     seen: dict[str, int] = {}
     for k, p in enumerate(phases):
         first = seen.setdefault(p.name, k) if p is not None else k
-        if p is not None and first != k:
+        if first != k:
             problem = f"is also the name of phase {first + 1}"
             yield Breach((k, "name"), problem, "give each phase its own name", p.name)
 
@@ -431,6 +430,7 @@ def named_agent_rules(m: Draft, agents: Sequence[int], *where: str) -> Breaches:
 def _formation_use_rules(m: Draft, phases: Written) -> Breaches:
     """Formations exist and can be blended to, tracked and reached."""
     forms: Mapping[str, Formation] = m.formations
+    n, sound = m.n or 0, {name: x for name, x in forms.items() if m.is_valid(("formations",), name)}
     held: str | None = ""  # name of the formation held; "": initial positions; None: unknown
     slotted: set[str] = set()  # names of formations that have slots to track
     for k, p in enumerate(phases):
@@ -450,14 +450,14 @@ def _formation_use_rules(m: Draft, phases: Written) -> Breaches:
                 problem = f"formation '{shaping.formation}' is given by distances alone, which have no axes"
                 remedy = "remove it, give the formation slots, or command an attitude by yaw_deg"
                 yield Breach((*path, "attitude"), problem, remedy)
-            if m.n is not None and form is not None and has_no_findings(m, shaping.formation):
-                yield from _slot_blend_rules(shaping, form, m.n, path)
+            if n and shaping.formation in sound:
+                yield from _slot_blend_rules(shaping, sound[shaping.formation], n, path)
             held = shaping.formation
-        form = forms.get(held) if held else None
+        form = sound.get(held) if held else None
         tracked = p.tracks_slots and held not in slotted and m.is_valid(path, "control")
-        if not tracked or m.n is None or form is None or not held or not has_no_findings(m, held):
+        if not tracked or not n or form is None or not held:
             continue
-        if form.distances is not None and form.slot_array(m.n) is None:
+        if form.distances is not None and form.slot_array(n) is None:
             problem = f"formation '{held}' has no slots to track"
             remedy = f"give formations.{toml_key(held)} a shape or slots, or change control"
             yield Breach((*path, "control"), problem, remedy, p.control)

@@ -24,10 +24,10 @@ def assignment_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
     if first is None or slots is None or not 2 <= mission.n_agents <= _COMPARED:
         return
     index, masses = mission.phases.index(first), mission.fleet.mass
-    if index >= len(preflight.planned_phases):
+    if index >= len(preflight.flown_phases):
         return
     for name in ("as it is", "shortest", "safe"):
-        other, planned = mission, preflight.planned_phases[index]
+        other, planned = mission, preflight.flown_phases[index]
         if name not in ("as it is", mission.assignment):
             other = mission.with_assignment(name)
             planned = preview_phases(other, index + 1)[0][index]

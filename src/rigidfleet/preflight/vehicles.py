@@ -128,7 +128,7 @@ def vehicle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         return
     preflight.worst["rotor_force"] = preflight.vehicles.rotor_force[:4]
     preflight.worst["tilt"] = *preflight.vehicles.tilt[:3], mission.limits.tilt_deg
-    exact = {planned.phase for planned in preflight.planned_phases if planned.exact}
+    exact = {planned.phase for planned in preflight.flown_phases if planned.exact}
     if preflight.vehicles.beyond is not None:
         share, who, phase, need = preflight.vehicles.beyond
         fails = share > mission.limits.saturation and phase in exact
@@ -144,7 +144,7 @@ def vehicle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
             f" where '{jump[3]}' begins; no vehicle follows a jump. Use smoothness = 'jerk'"
         )
         yield Remark("note", "jumps", text)
-    yield from _jet_remarks(mission, preflight.planned_phases)
+    yield from _jet_remarks(mission, preflight.flown_phases)
 
 
 def _jet_remarks(mission: Mission, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
