@@ -165,8 +165,7 @@ def _shape_rules(m: Draft, form: Formation, shape: str, n: int | None, path: Key
     if shape not in shapes.SHAPES:
         yield Breach("shape", "unknown shape", suggest_shape(shape))
     elif form.size is None:
-        if m.is_valid(path, "size"):
-            yield Breach("size", "is missing", "add size, the edge length [m]")
+        yield Breach("size", "is missing", "add size, the edge length [m]")
     elif n is not None:
         try:
             slots = form.slot_array(n)

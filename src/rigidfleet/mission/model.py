@@ -327,14 +327,14 @@ class Mission(Contents, Shown):
                 lies = commanded = dcm_from_euler(np.deg2rad(angles))
             if p.turns_away:
                 lies = commanded = None
+            up = np.eye(3)[2] if lies is None else lies[:, 2]
             if (vertical := p.vertical) is not None and vertical.has_way_per_vehicle:
-                before, up = None, np.eye(3)[2] if lies is None else lies[:, 2]
+                before = None
                 who, places = vertical.movers(self.n_agents), places.copy()
                 places[who] -= np.outer(places[who] @ up, up)  # all on one level
             if (shaping := p.shaping) is None:
                 continue
             name = shaping.formation
-            up = np.eye(3)[2] if lies is None else lies[:, 2]
             axes: Floats | None = np.eye(3)  # axes of this formation in those of the one before
             if self.leaves_attitude_free(p):
                 axes = lies = None
@@ -578,11 +578,9 @@ class Mission(Contents, Shown):
         if self.vehicle_models is not None:
             return np.array([model.linear_drag[0] for model in self.vehicle_models])
         d = self.all_disturbances
-        if d.drag is None and not any(d.wind) and d.gusts is None:
-            return np.zeros(self.n_agents)
-        if d.drag is None:
-            return DRAG * self.fleet.mass
-        return np.broadcast_to(np.array(d.drag, dtype=np.float64), self.n_agents).copy()
+        moves_air = any(d.wind) or d.gusts is not None
+        own = d.drag if d.drag is not None else DRAG * self.fleet.mass if moves_air else 0.0
+        return np.broadcast_to(np.array(own, dtype=np.float64), self.n_agents).copy()
 
     @cached_property
     def lost_at(self) -> Floats:

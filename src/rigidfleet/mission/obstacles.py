@@ -81,11 +81,8 @@ class Moving(Solid):
     @property
     def lifetime(self) -> tuple[float, float]:
         """Times from which and until which the obstacle is there [s]."""
-        since, until = records.ALWAYS
-        return (
-            since if self.appears is None else self.appears,
-            until if self.vanishes is None else self.vanishes,
-        )
+        since, until = self.appears, self.vanishes
+        return -math.inf if since is None else since, math.inf if until is None else until
 
     @cached_property
     def solid(self) -> Solids:
@@ -276,8 +273,7 @@ def _height_map_rules(m: FindingCollector, thing: Heights, path: Keys) -> Breach
         yield Breach("file", NOT_A_FILE, "load the mission from its file, or give heights")
         return
     if thing.heights is None:
-        if m.is_valid(path, "heights"):
-            yield Breach("heights", "is missing", "add heights, or a file with them")
+        yield Breach("heights", "is missing", "add heights, or a file with them")
         return
     rows = {len(row) for row in thing.heights}
     count = len(thing.heights) * max(rows, default=0)

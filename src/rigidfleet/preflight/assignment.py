@@ -38,14 +38,13 @@ def assignment_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         clearance = assignment.closest_approach(*planned.path_ends, mission.agents.radius)[0]
         order = tuple((other.assigned_slots[first.formation] + 1).tolist())
         preflight.assignments[name] = Assignment(order, length, clearance)
-    radius = mission.fleet.radius
     now, short, safe = preflight.assignments.values()
     before, after = now.path_length_m, short.path_length_m
     if after < (1 - _WORTH) * before - _SHORT:
         text = f'assignment = "shortest" reduces the total path length from {before:.1f} m to {after:.1f} m'
         yield Remark("note", "assignment", text)
     before, after = now.min_clearance_m, safe.min_clearance_m
-    if after > before + 0.05 and before < 2 * radius.max():
+    if after > before + 0.05 and before < 2 * mission.fleet.radius.max():
         what = "increases the minimum clearance on the paths"
         text = f'assignment = "safe" {what} from {before:.2f} m to {after:.2f} m'
         yield Remark("note", "assignment", text)

@@ -52,6 +52,8 @@ _FORCES = {
 }  # fmt: skip
 
 Level = Literal["fails", "note"]
+#: What holds a formation in the phases that have it.
+HeldBy = Literal["tracking", "distances", "nothing"]
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ class FormationCheck:
 
     name: str
     rigidity: Rigidity | None
-    held_by: Literal["tracking", "distances", "nothing"]
+    held_by: HeldBy
     realisations: Realisations | None = None
     solve: solvers.Method = "dense"
     spectrum: Spectrum | None = None

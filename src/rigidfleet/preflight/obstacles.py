@@ -47,7 +47,7 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
         thing = mission.obstacles[b]
         if rank >= _NEAREST and far[:, b].min() > 0:
             break
-        worst: dict[bool, tuple[float, float, int, str]] = {}
+        worst = dict[bool, tuple[float, float, int, str]]()
         for k in np.argsort(far[:, b], kind="stable").tolist():
             planned = way[k]
             if far[k, b] >= worst.get(planned.exact, (np.inf,))[0]:
@@ -64,8 +64,7 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
         if compared > _COMPARED:
             skipped = near[rank:][far[:, near[rank:]].min(axis=0) <= 0].tolist()
             break
-        if worst:
-            shown[b] = worst
+        shown[b] = worst
     for b in sorted(shown):
         thing, (clearance, t, i, _) = mission.obstacles[b], min(shown[b].values())
         preflight.clearance.append((thing.name, clearance, t, f"agent {i + 1}"))

@@ -102,13 +102,11 @@ def _crossing_remark(mission: Mission, planned: PlannedPhase, at: _Nearest) -> R
     assert planned.path_ends is not None
     least = min(float(proximity.nearest(places).min()) for places in planned.path_ends)
     spaced = f"place slots at least {math.sqrt(2) * needed:.2f} m apart (now {least:.2f} m)"
-    promised = mission.assigned_turn(before, after) is not None
-    if promised:
+    if mission.assigned_turn(before, after) is not None:
         text += f"{spaced[0].upper()}{spaced[1:]}"
     else:
         text += 'Assign agents to near slots: assignment = "each"'
-    if not promised and least < math.sqrt(2) * needed:
-        text += f"; and {spaced}"
+        text += f"; and {spaced}" * (least < math.sqrt(2) * needed)
     return _collision_remark(mission, at, planned.phase, text, exact=planned.exact)
 
 
