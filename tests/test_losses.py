@@ -580,6 +580,15 @@ def test_check_follows_the_way_after_the_loss():
     assert not assess(simulate(blocked)).passed
 
 
+def test_a_check_has_the_plan_and_what_is_flown_of_it():
+    """The planned phases are all of the mission's; those flown end where the plan is left."""
+    m = mission(LOST | {"on_loss": "land"})
+    found = check(m, search=False)
+    assert [x.phase for x in found.planned_phases] == [p.name for p in m.phases]
+    assert found.planned_phases[-1].time[-1] == m.latest_end
+    assert found.flown_phases[-1].time[-1] == m.abandons_at < m.latest_end
+
+
 def test_check_tells_what_a_link_does_to_rigidity():
     """A square of all pairs that loses a diagonal keeps 5 edges, which in the plane are just enough."""
     found = check(rotors({}, network=CUT), search=False)

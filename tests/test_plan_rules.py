@@ -67,7 +67,7 @@ CASES: list[tuple[str, str, list[Any], dict[str, Any]]] = [
     ("phases[1].file", "its first point", [follow([9.0, 0.0, 5.0])], {}),
     ("phases[2].duration", "no time keeps the limits", [TAKE, FLY | {"velocity": [4, 0, 0]}], {}),
     # courses
-    ("phases", "needs a ground, and none is below agent 1", [TAKE, land(9.0)], {"obstacles": [FAR_HILLS]}),
+    ("phases[2].kind", "needs a ground, and none is below agent 1", [TAKE, land(9.0)], {"obstacles": [FAR_HILLS]}),
     # transitions
     ("phases[2].duration", "is too short for 2 groups", [TAKE, land(5.0, stagger=6.0)], GROUNDED),
     ("phases[2].places", "needs vehicles that stand on the ground", [TAKE, land(30.0, places="own")], GROUNDED),

@@ -32,6 +32,15 @@ def refusal(*arguments, **changes) -> str:
     return str(error.value)
 
 
+@pytest.mark.parametrize("position", [None, [], 3])
+@pytest.mark.parametrize("names", ["drone", ["drone"]])
+def test_positions_that_are_wrong_are_told_and_no_names_of_vehicles(position, names):
+    """Where the number of agents is not known, the finding is about their positions, not about their vehicles."""
+    with pytest.raises(MissionError) as error:
+        mission(agents_position=position, agents_vehicle=names)
+    assert [finding.key for finding in error.value.findings] == ["agents.position"]
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_models_can_fly(name):
     """Each model hovers well below its limit, has a source for each number, and a stable attitude control."""

@@ -1,5 +1,6 @@
 """Ways found round obstacles: phases of kind "go"."""
 
+import re
 from itertools import pairwise
 from typing import Any
 
@@ -163,6 +164,27 @@ def test_no_way_says_what_stands_in_it(keys, needs):
     assert "no way is found" in finding.problem
     assert f"needs {needs:.2f} m between '" in finding.problem
     assert f"which leave 1.20 m: {needs - 1.2:.2f} m are missing" in finding.problem
+
+
+@pytest.mark.parametrize("bottom", [-60.0, 0.0])
+def test_walls_on_the_ground_are_named_and_not_the_ground(bottom):
+    """Walls that begin at the ground leave a gap above it: what is named is the gap, and a place within the walls."""
+    walls = [
+        {"kind": "box", "name": name, "min": [-0.5, a, bottom], "max": [0.5, b, 90]}
+        for name, a, b in (("left", 0.2, 90.0), ("right", -90.0, -0.2))
+    ]
+    with pytest.raises(MissionError) as caught:
+        complete_times(going({"kind": "ground"}, *walls, formations={"square": FORMS["square"]}))
+    (finding,) = caught.value.findings
+    assert "between 'left' and 'right', which leave 0.40 m" in finding.problem
+    place = re.findall(r"\((.*), (.*), (.*)\) m, 'square' at yaw (.*)° needs", finding.problem)[0]
+    x, _, z, yaw = map(float, place)
+    turn = dcm_from_rotation_vector(np.array([0.0, 0.0, np.deg2rad(yaw)]))
+    corners = [x, 0.0, 0.0] + np.array(
+        [[a, b, 0.0] for a in (-1.5, 1.5) for b in (-1.5, 1.5)]
+    ) @ turn
+    assert (abs(corners[:, 0]) < 0.75).any()  # a vehicle is in a wall: all of y is, but for 0.4 m
+    assert z > 0.25
 
 
 def test_what_is_written_flies_the_same_bits(tmp_path):

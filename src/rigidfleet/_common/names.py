@@ -8,10 +8,6 @@ from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
-import numpy as np
-
-from rigidfleet.typing import Floats
-
 Dimension = str  # time, length, angle or quotients of them
 #: Units by dimension and factor to s, m and rad.
 _UNITS = {
@@ -95,14 +91,6 @@ class ColumnMeaning(NamedTuple):
             return _DIMENSIONS[place[1]]
         special = {"time": "time", "duration": "time", "yaw": "angle", "yaw_rate": "angle/time"}
         return "length" if self.kind in (*DIRECTIONS, "height") else special.get(self.kind, "")
-
-
-def matrix_to_enu(axes: str) -> Floats:
-    """The matrix (3, 3) from places along three directions to east, north, up."""
-    turn = np.zeros((3, 3))
-    for k, letter in enumerate(axes):
-        turn[AXES[letter][0], k] = AXES[letter][1]
-    return turn
 
 
 def unit_of(text: str) -> tuple[Dimension, float] | None:

@@ -59,9 +59,9 @@ class ContentError(ValueError):
         super().__init__((words if words.endswith("?") else f"{words}.").replace("?. ", "? "))
 
 
-def fault(problem: str, remedy: str = "", line: int = 0, text: str = "") -> ContentError:
+def fault(problem: str, remedy: str = "", line: int = 0) -> ContentError:
     """The error of a single fault."""
-    return ContentError(Fault(line, text, problem, remedy))
+    return ContentError(Fault(line, "", problem, remedy))
 
 
 class TextTable:

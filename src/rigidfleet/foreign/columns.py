@@ -14,12 +14,12 @@ from rigidfleet._common.names import (
     DIRECTIONS,
     ROLES,
     SOURCE_WORDS,
-    matrix_to_enu,
     meaning_of,
     unit_of,
 )
 from rigidfleet._common.tables import DEFAULT, SEPARATORS, TextTable, are_axes, fault, is_number
 from rigidfleet.errors import TrajectoryError
+from rigidfleet.math.geodesy import matrix_to_enu
 from rigidfleet.typing import Floats, Ints
 
 #: Columns of a trajectory without names, as TUM's tools for trajectories of cameras write it.

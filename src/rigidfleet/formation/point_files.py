@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import matrix_to_enu, meaning_of
+from rigidfleet._common.names import meaning_of
 from rigidfleet._common.tables import ContentError, Fault, TextTable, fault, notes_on_units
 from rigidfleet._common.text import first_few
 from rigidfleet.errors import Finding, MissionError
+from rigidfleet.math.geodesy import matrix_to_enu
 from rigidfleet.typing import Floats, Ints
 
 #: Greatest size of a file of points [bytes], and number of wrong lines that are named one by one.

@@ -1,16 +1,25 @@
-"""Places on the Earth, on the ellipsoid WGS 84."""
+"""Places on the Earth, on the ellipsoid WGS 84, and directions there."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._common.names import AXES
 from rigidfleet.typing import Floats
 
 #: Latitude, longitude [deg] and height above mean sea level [m] of a place on the Earth.
 Geodetic = tuple[float, float, float]
 #: Equatorial radius [m] and square of the eccentricity of WGS 84.
 _RADIUS, _ECCENTRICITY = 6_378_137.0, 6.694_379_990_14e-3
+
+
+def matrix_to_enu(axes: str) -> Floats:
+    """The matrix (3, 3) from places along three directions, such as "ned", to east, north, up."""
+    turn = np.zeros((3, 3))
+    for k, letter in enumerate(axes):
+        turn[AXES[letter][0], k] = AXES[letter][1]
+    return turn
 
 
 def enu_of(geodetic: ArrayLike, origin: Geodetic) -> Floats:

@@ -177,8 +177,7 @@ def _count_agents(data: Mapping[str, Any]) -> int | None:
     position = look_up(data, ("agents", "position"))
     if isinstance(position, dict):
         count = position.get("count")
-        whole = isinstance(count, int) and not isinstance(count, bool)
-        return count if whole and 0 < count <= bounds.AGENTS else None
+        return count if type(count) is int and 0 < count <= bounds.AGENTS else None
     return len(position) if isinstance(position, list) and position else None
 
 
@@ -211,10 +210,9 @@ def _fixed_agent_rules(m: Draft) -> Breaches:
     """Fixed agents exist, and nothing is to move them or to change what they hold."""
     if m.findings or not m.agents.fixed:
         return
-    agents, d = m.agents, m.disturbances
+    agents, n, solver = m.agents, m.n or 0, m.constraint.solver
     yield from phases.named_agent_rules(m, agents.fixed)
-    lost = d is not None and d.lost
-    n, solver = len(agents.position), m.constraint.solver
+    lost = m.disturbances and m.disturbances.lost
     for wrong, problem, remedy in (
         (any(any(agents.velocity[i - 1]) for i in agents.fixed if i <= n), "starts with a velocity", "remove it"),
         (agents.vehicle or lost, "needs points that are not lost", "remove these keys"),
@@ -232,11 +230,9 @@ def _too_many_touching_rules(m: Draft) -> Breaches:
         return
     agents: Agents = m.agents
     places = {"at the start": np.array(agents.position)}
-    for name, form in m.formations.items():
-        slots = form.slot_array(n)
-        places |= {} if slots is None else {f"in '{name}'": slots}
+    places |= {f"in '{name}'": form.slot_array(n) for name, form in m.formations.items()}
     for where, points in places.items():
-        pairs = count_pairs_within(points, 2 * max(agents.radius))
+        pairs = 0 if points is None else count_pairs_within(points, 2 * max(agents.radius))
         if pairs > bounds.TOUCHING:
             problem = (
                 f"with the largest radius, {pairs:,} pairs of agents touch {where};"

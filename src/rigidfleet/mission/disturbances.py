@@ -44,9 +44,7 @@ def gust_intensity(gusts: Gusts, wind: float) -> Floats:
 
 def disturbance_rules(m: Draft) -> Breaches:
     """Disturbances have one entry per agent, and an effect."""
-    d: Disturbances | None = m.disturbances
-    if d is None:
-        return
+    d = m.disturbances or Disturbances.model_construct()
     for key in ("drag", "mass_error"):
         yield from m.one_per_agent_rules(d, key, alone=", or a single number")
     drag = d.drag if isinstance(d.drag, tuple) else (d.drag,)
@@ -102,8 +100,8 @@ def _gust_rules(m: Draft, gusts: Gusts, wind: bool) -> Breaches:
 
 def disturbance_storage_rules(m: Draft) -> Breaches:
     """Tables of gusts and noise fit into memory."""
-    d: Disturbances | None = m.disturbances
-    if d is None or m.end is None or m.n is None or m.findings:
+    d = m.disturbances or Disturbances.model_construct()
+    if m.n is None or m.findings:
         return
     longest = _MOST_NUMBERS / (6 * m.n)  # of a table with one sample a second
     problem = f"would need too much memory for {m.n} agents over {m.end:g} s"

@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -100,7 +101,9 @@ def draft(
     if not below:  # some agents cross the whole shape
         way = float(np.linalg.norm(np.ptp(np.vstack([slots, start - centre]), axis=0)))
     blend = max(4, blend_time(way))
-    climb, flights = _rest_to_rest_seconds(aloft - centre), _rows_and_durations(aloft, waypoints)
+    stops, climb = np.array([aloft, *waypoints]), _rest_to_rest_seconds(aloft - centre)
+    # Each waypoint as a list in TOML, and the duration of the way there.
+    flights = [(_toml_row(b), _rest_to_rest_seconds(b - a)) for a, b in pairwise(stops)]
     lasts = climb + blend + _SETTLE + sum(time for _, time in flights) + _HOLD
     limit = math.ceil(LIFT * mass * 9.81) if thrust_limit is None else thrust_limit
     extent = json.dumps([float(x) for x in size]) if len(size) > 1 else f"{size[0]:g}"
@@ -131,9 +134,8 @@ def shape_for(agents: int | None) -> str:
 
 def agents_for(shape: str) -> int:
     """Return the usual number of agents of a shape."""
-    taken = shapes.SHAPES[shape].agents
     usual = {"line": 3, "polygon": 5, "pyramid": 5, "v": 5, "grid": 9, "sphere": 12, "helix": 12}
-    return usual.get(shape, taken.start)
+    return usual.get(shape, shapes.SHAPES[shape].agents.start)
 
 
 def _starts_and_whether_below(slots: Floats, apart: float) -> tuple[Floats, bool]:
@@ -162,16 +164,6 @@ def blend_time(way: float) -> int:
 def output_step(n: int, lasts: float) -> float:
     """Time between samples [s] with which a mission of this duration [s] does not store too much."""
     return math.ceil(20 * lasts * n / _STORED) / 20
-
-
-def _rows_and_durations(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[tuple[str, int]]:
-    """Each waypoint as a list in TOML, and the duration [s] of the way there from a position (3,) [m]."""
-    flights = []
-    for waypoint in waypoints:
-        to = np.asarray(waypoint, dtype=float)
-        flights.append((_toml_row(to), _rest_to_rest_seconds(to - at)))
-        at = to
-    return flights
 
 
 def _rest_to_rest_seconds(way: Floats) -> int:

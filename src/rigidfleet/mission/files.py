@@ -19,7 +19,7 @@ import numpy as np
 
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, TrajectoryError
-from rigidfleet.mission import bounds
+from rigidfleet.mission.geojson import read_geojson
 from rigidfleet.mission.text import text_error
 
 #: What stands before the digest of a file.
@@ -30,26 +30,18 @@ _DOUBTS = ". Note: "
 NOT_A_FILE = "is read only with a mission file, as its path is relative to that"
 
 
-class _Named(NamedTuple):
-    """A file that a mission names: the table and key that do, the key of its numbers, and who reads them.
+#: What a file gives: rows of numbers (of trajectories: of each vehicle), notes, and colours of points if it has any.
+_Content = tuple[list[Any], *tuple[Sequence[str], ...]]
 
-    It may be a ``folder`` of files, one a vehicle.
-    """
+
+class _Named(NamedTuple):
+    """A file that a mission names: the table and key that do, the key of its numbers, and who reads them."""
 
     table: dict[str, Any]
     key: str
     becomes: str
     where: str
-    read: Callable[[bytes, str], Content]
-    folder: bool = False
-
-
-class Content(NamedTuple):
-    """What a file gives: rows of numbers (of trajectories: of each vehicle), colours of points if any, and notes."""
-
-    rows: list[Any]
-    colours: tuple[str, ...] | None = None
-    notes: Sequence[str] = ()
+    read: Callable[[bytes, str], _Content]
 
 
 def inline_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, Any], str]:
@@ -75,7 +67,7 @@ def inline_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str,
         content = b"".join(
             read_bytes(_path_in_folder(path, named.where, x)) for x in _names_of_files(path, named)
         )
-        rows, colours, notes = named.read(content, str(path.parent / name))
+        rows, notes, *colours = named.read(content, str(path.parent / name))
         origin = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
         if notes:
             origin += f"{_DOUBTS}{' '.join('; '.join(notes).split())}"
@@ -84,8 +76,8 @@ def inline_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str,
         if named.becomes == "trajectories":
             named.table.pop("units", None), named.table.pop("axes", None)
         named.table[named.becomes] = rows
-        if colours is not None and named.becomes == "slots":
-            named.table.setdefault("colour", [*colours])
+        if colours and named.becomes == "slots":
+            named.table.setdefault("colour", colours)
     return data, "".join(digests) + to_toml(data) if digests else text
 
 
@@ -102,7 +94,7 @@ def notes_on_files(text: str) -> list[str]:
 
 
 def _names_of_files(path: Path, named: _Named) -> list[str]:
-    """Names of the files of a name: itself, or those in a folder.
+    """Names of the files of a name: itself, or those in a folder of trajectories, one a vehicle.
 
     Raises
     ------
@@ -111,7 +103,7 @@ def _names_of_files(path: Path, named: _Named) -> list[str]:
     """
     name = named.table[named.key]
     place = _path_in_folder(path, named.where, name)
-    if not named.folder or not place.is_dir():
+    if named.becomes != "trajectories" or not place.is_dir():
         return [name]
     from rigidfleet.foreign.files import groups_of_files
 
@@ -134,7 +126,7 @@ def _entries_with_files(data: dict[str, Any]) -> Iterator[_Named]:
     for k, phase in _tables_with_file(phases, "follow", "trajectories"):
         said = {key: phase[key] for key in ("units", "axes") if isinstance(phase.get(key), str)}
         read = partial(_read_trajectories, yaw=phase.get("yaw") == "file", said=said)
-        yield _Named(phase, "file", "trajectories", f"phases[{k}].file", read, True)
+        yield _Named(phase, "file", "trajectories", f"phases[{k}].file", read)
     for name, form in forms.items() if isinstance(forms, dict) else ():
         if isinstance(form, dict) and isinstance(form.get("slots"), str):
             yield _Named(form, "slots", "slots", f"formations.{name}.slots", _read_points)
@@ -144,7 +136,7 @@ def _entries_with_files(data: dict[str, Any]) -> Iterator[_Named]:
         yield _Named(thing, "file", "heights", f"obstacles[{k}].file", _read_heights)
     for key in ("fences", "people"):
         for k, area in _tables_with_file(data.get(key), None, "coordinates"):
-            yield _Named(area, "file", "coordinates", f"{key}[{k}].file", _read_areas)
+            yield _Named(area, "file", "coordinates", f"{key}[{k}].file", read_geojson)
 
 
 def _tables_with_file(
@@ -177,14 +169,14 @@ def _path_in_folder(path: Path, where: str, name: str) -> Path:
     raise MissionError([Finding(str(path), where, name, problem, remedy)])
 
 
-def _read_points(data: bytes, name: str) -> Content:
+def _read_points(data: bytes, name: str) -> _Content:
     from rigidfleet.formation.point_files import parse_points
 
     points = parse_points(data, name)
-    return Content(points.slots.tolist(), points.colours, points.notes)
+    return points.slots.tolist(), points.notes, *(points.colours or ())
 
 
-def _read_trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Content:
+def _read_trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> _Content:
     """Pieces of each vehicle; with a ``yaw`` if that is asked for. What the file leaves in doubt is not flown.
 
     Where a file has samples, they are joined by the spline with the least jerk (C4): it is not only judged but flown.
@@ -215,7 +207,7 @@ def _read_trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) 
         why = next((note for note in read.notes if "yaw" in note), "has no yaw")
         raise text_error(name, why, "remove yaw = 'file', or give a file with a yaw and its unit")
     rows = [curve_to_rows(c._replace(pieces=np.nan_to_num(c.pieces))) for c in curves]
-    return Content(rows, notes=notes)
+    return rows, notes
 
 
 #: A height that no terrain has [m], and one by which files mark cells without data besides such heights.
@@ -234,14 +226,7 @@ def missing_cells_text(heights: Any) -> str:
     return f"has {len(cells):,} cells without data, the first in row {i + 1}, column {j + 1}: {z[i, j]:g}"
 
 
-def _read_areas(data: bytes, name: str) -> Content:
-    from rigidfleet.mission.geojson import read_geojson
-
-    polygons, notes = read_geojson(data, name)
-    return Content(polygons, notes=notes)
-
-
-def _read_heights(data: bytes, name: str) -> Content:
+def _read_heights(data: bytes, name: str) -> _Content:
     """Numbers of a CSV or NPY file, row by row."""
     try:
         if name.lower().endswith(".npy"):
@@ -262,7 +247,4 @@ def _read_heights(data: bytes, name: str) -> Content:
         raise text_error(name, "is a list of places x, y and z", remedy)
     if why := missing_cells_text(heights):
         raise text_error(name, why, FILL)
-    if heights.size > bounds.HEIGHTS:
-        problem = f"has {heights.size:,} heights; the maximum is {bounds.HEIGHTS:,}"
-        raise text_error(name, problem, "use a coarser grid")
-    return Content(heights.tolist())
+    return heights.tolist(), ()

@@ -14,7 +14,7 @@ from rigidfleet.formation.rest import rest_places_beside
 from rigidfleet.math import proximity
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
-from rigidfleet.mission.findings import FindingCollector, Keys, suggest_shape
+from rigidfleet.mission.findings import Keys, suggest_shape
 from rigidfleet.mission.rules import Breach, Breaches, Draft, unused_key_rules
 from rigidfleet.mission.schema import Formation
 
@@ -22,21 +22,14 @@ from rigidfleet.mission.schema import Formation
 _SHOWN = 6
 #: Light of vehicles that rest.
 _DARK = "#000000"
-#: Number of points below which all distances are compared first.
-_FEW = 100
 #: Approximate maximum number of triangles and tetrahedra that are checked among distances.
 _MOST_CLIQUES = 5e6
-
-
-def has_no_findings(m: FindingCollector, name: str) -> bool:
-    """Whether a formation has no findings."""
-    return m.is_valid(("formations",), name)
 
 
 def coincident_pairs(points: ArrayLike) -> list[tuple[int, int]]:
     """Pairs (first, later) of points (N, 3) [m] that are closer than half the smallest length."""
     p, apart = np.asarray(points, dtype=np.float64), bounds.LENGTH.least / 2
-    if len(p) < 2 or (len(p) < _FEW and proximity.nearest(p).min() > 2.0 * apart):
+    if len(p) < 2:
         return []
     # Cells first: a search tree of many equal points degenerates and compares all pairs.
     _, one, cell = np.unique(np.round(p / apart), axis=0, return_index=True, return_inverse=True)
@@ -113,7 +106,7 @@ def _single_formation_rules(m: Draft, form: Formation, name: str) -> Breaches:
         yield from _edge_rules(m, form, n, path)
     if form.distances is not None and m.is_valid(path, "edges", "distances"):
         yield from _distance_rules(form, form.distances, n)
-    if (form.dimension or m.data.get("dimension")) == 2 and has_no_findings(m, name):
+    if (form.dimension or m.data.get("dimension")) == 2 and m.is_valid(("formations",), name):
         slots = form.slot_array(n)
         if slots is not None and distance_geometry.dimension(slots) > 2:
             problem = "the slots do not lie in a plane, but the dimension is 2"
@@ -172,8 +165,7 @@ def _shape_rules(m: Draft, form: Formation, shape: str, n: int | None, path: Key
     if shape not in shapes.SHAPES:
         yield Breach("shape", "unknown shape", suggest_shape(shape))
     elif form.size is None:
-        if m.is_valid(path, "size"):
-            yield Breach("size", "is missing", "add size, the edge length [m]")
+        yield Breach("size", "is missing", "add size, the edge length [m]")
     elif n is not None:
         try:
             slots = form.slot_array(n)

@@ -372,8 +372,7 @@ class Fly(Steering):
         """The waypoint and the attitude."""
         v = self.velocity
         velocity = ["any velocity" if isinstance(v, str) else _as_text(v, "m/s")] if any(v) else []
-        rest = super().leads_to
-        return ", ".join([_as_text(self.position, "m"), *velocity, *([rest] if rest else [])])
+        return ", ".join(filter(None, [_as_text(self.position, "m"), *velocity, super().leads_to]))
 
 
 class Go(Attitude, AnyPhase):

@@ -9,7 +9,6 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet.mission.findings import Keys, suggest
-from rigidfleet.mission.formations import has_no_findings
 from rigidfleet.mission.kinds import AnyPhase, seconds
 from rigidfleet.mission.obstacles import is_ground
 from rigidfleet.mission.phases import named_agent_rules
@@ -32,15 +31,13 @@ _NO_GROUND = (
 
 def loss_rules(m: Draft) -> Breaches:
     """Vehicles and links that can be lost, what can follow, and a ground for landings."""
-    d: Disturbances | None = m.disturbances
+    d = m.disturbances or Disturbances.model_construct()
     yield from _abort_rules(m)
     grounded = not m.is_valid((), "obstacles") or any(map(is_ground, m.obstacles))
     for k, p in enumerate(m.phases):
         if p.grounded and not grounded:
             yield Breach(("phases", k, "kind"), *_NO_GROUND)
     links = m.network.lost if m.network else ()
-    if d is None:
-        return
     yield from _lost_vehicle_rules(m, d)
     for k, one in enumerate(d.stuck):
         path = (_TABLE, "stuck", k)
@@ -67,10 +64,9 @@ def loss_rules(m: Draft) -> Breaches:
 
 def _abort_rules(m: Draft) -> Breaches:
     """An abort is ordered in time, while slots are tracked."""
-    options: Aborting | None = m.abort
-    if options is not None:
-        yield from named_agent_rules(m, options.agents, "abort", "agents")
-    if options is None or options.at is None or m.end is None or m.findings:
+    options = m.abort or Aborting.model_construct()
+    yield from named_agent_rules(m, options.agents, "abort", "agents")
+    if options.at is None or math.isnan(m.end) or m.findings:
         return
     begins = options.at + options.reaction
     if not 0.0 < begins < m.end:  # nothing has been flown at the start
@@ -122,7 +118,7 @@ def agent_number_rules(m: Draft, where: Keys, agents: Sequence[int], again: str 
 
 def loss_time_rules(m: Draft, time: float, path: Keys) -> Breaches:
     """A loss is before the end of the mission."""
-    if m.end is not None and time >= m.end:
+    if time >= m.end:
         problem = f"is not before the end of the mission at {m.end:g} s"
         yield Breach((*path, "time"), problem, "give an earlier time or remove the entry")
 
@@ -162,7 +158,7 @@ def _level_formation_rules(m: Draft, d: Disturbances, n: int, first: float) -> B
             remedy = suggest(name, forms) or f"formations: {', '.join(forms)}"
             yield Breach(where, "there is no such formation", remedy)
             return
-        slots = forms[name].slot_array(n) if has_no_findings(m, name) else None
+        slots = forms[name].slot_array(n) if m.is_valid(("formations",), name) else None
         words = "it has no slots to track" if slots is None else _height_spread_text(slots, radius)
         if words:
             remedy = "name a level formation, such as a line or a square"

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from copy import copy
-from functools import cached_property, lru_cache, wraps
+from functools import cached_property, wraps
 from hashlib import sha256
 from typing import Any, Literal, NamedTuple, Self, TypeVar
 
@@ -327,14 +327,14 @@ class Mission(Contents, Shown):
                 lies = commanded = dcm_from_euler(np.deg2rad(angles))
             if p.turns_away:
                 lies = commanded = None
+            up = np.eye(3)[2] if lies is None else lies[:, 2]
             if (vertical := p.vertical) is not None and vertical.has_way_per_vehicle:
-                before, up = None, np.eye(3)[2] if lies is None else lies[:, 2]
+                before = None
                 who, places = vertical.movers(self.n_agents), places.copy()
                 places[who] -= np.outer(places[who] @ up, up)  # all on one level
             if (shaping := p.shaping) is None:
                 continue
             name = shaping.formation
-            up = np.eye(3)[2] if lies is None else lies[:, 2]
             axes: Floats | None = np.eye(3)  # axes of this formation in those of the one before
             if self.leaves_attitude_free(p):
                 axes = lies = None
@@ -479,7 +479,9 @@ class Mission(Contents, Shown):
             slots, masses = slots[left], masses[left]
         if not len(edges) or min(len(edges), 3 * len(masses)) > _DENSE:
             return _DAMPING[1]
-        return _automatic_damping(slots.tobytes(), edges.tobytes(), masses.tobytes())
+        J = constraint_jacobian.jacobian(slots[None], edges)
+        (singular,) = constraint_jacobian.least_singular(J, masses)  # of mbar J M^-1 J^T
+        return float(np.clip(singular**2 / 4, *_DAMPING))
 
     @property
     def latest_end(self) -> float:
@@ -576,11 +578,9 @@ class Mission(Contents, Shown):
         if self.vehicle_models is not None:
             return np.array([model.linear_drag[0] for model in self.vehicle_models])
         d = self.all_disturbances
-        if d.drag is None and not any(d.wind) and d.gusts is None:
-            return np.zeros(self.n_agents)
-        if d.drag is None:
-            return DRAG * self.fleet.mass
-        return np.broadcast_to(np.array(d.drag, dtype=np.float64), self.n_agents).copy()
+        moves_air = any(d.wind) or d.gusts is not None
+        own = d.drag if d.drag is not None else DRAG * self.fleet.mass if moves_air else 0.0
+        return np.broadcast_to(np.array(own, dtype=np.float64), self.n_agents).copy()
 
     @cached_property
     def lost_at(self) -> Floats:
@@ -602,8 +602,6 @@ class Mission(Contents, Shown):
         pairs, times = self.links_lost
         n = self.n_agents
         lost = pairs[times < t]
-        if not len(lost):
-            return np.ones(len(edges), dtype=np.bool_)
         return ~np.isin(edges[:, 0] * n + edges[:, 1], lost[:, 0] * n + lost[:, 1])
 
     @cached_property
@@ -650,17 +648,3 @@ class Mission(Contents, Shown):
     def on_loss(self) -> Literal["continue", "hold", "land", "abort"]:
         """What the others do when a vehicle or link is lost."""
         return self.all_disturbances.on_loss
-
-
-@lru_cache(64)
-def _automatic_damping(slots: bytes, edges: bytes, masses: bytes) -> float:
-    """Damping "auto" of a formation held: slots (N, 3) [m], edges (m, 2) and masses (N,) [kg].
-
-    All runs of a sweep ask for the same: it would be a tenth of a short flight.
-    """
-    r, pairs = np.frombuffer(slots).reshape(1, -1, 3), np.frombuffer(edges, np.int64).reshape(-1, 2)
-    J = constraint_jacobian.jacobian(r, pairs)
-    least, most = _DAMPING
-    (singular,) = constraint_jacobian.least_singular(J, np.frombuffer(masses))  # of mbar J M^-1 J^T
-    w = float(singular) ** 2
-    return min(max(w / 4, least), most)

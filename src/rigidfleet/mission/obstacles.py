@@ -40,16 +40,6 @@ class Solid(Part):
         """Lowest and highest corner (6,) [m] of a box along the world's axes at rest; None for all others."""
         return None
 
-    @property
-    def moves_and_times(self) -> tuple[Any, Any]:
-        """Displacements (W, 3) [m] and their times (W,) [s]; empty if the obstacle does not move."""
-        return (), ()
-
-    @property
-    def lifetime(self) -> tuple[float, float]:
-        """Times from which and until which the obstacle is there [s]."""
-        return records.ALWAYS
-
     @cached_property
     def solid(self) -> Solids:
         """The obstacle as arrays.
@@ -59,8 +49,7 @@ class Solid(Part):
         ValueError
             The points of a hull lie in a plane.
         """
-        ways, times = self.moves_and_times
-        return records.one_solid(self.solid_at_rest, times, ways, self.lifetime)
+        return records.one_solid(self.solid_at_rest)
 
 
 class Moving(Solid):
@@ -81,7 +70,7 @@ class Moving(Solid):
 
     @property
     def moves_and_times(self) -> tuple[Any, Any]:
-        """Displacements (W, 3) [m] and their times (W,) [s]."""
+        """Displacements (W, 3) [m] and their times (W,) [s]; empty if the obstacle does not move."""
         if self.velocity is not None and any(self.velocity):
             return np.outer([0.0, _EVER], self.velocity), np.array([0.0, _EVER])
         if self.waypoints is None:
@@ -92,11 +81,14 @@ class Moving(Solid):
     @property
     def lifetime(self) -> tuple[float, float]:
         """Times from which and until which the obstacle is there [s]."""
-        since, until = records.ALWAYS
-        return (
-            since if self.appears is None else self.appears,
-            until if self.vanishes is None else self.vanishes,
-        )
+        since, until = self.appears, self.vanishes
+        return -math.inf if since is None else since, math.inf if until is None else until
+
+    @cached_property
+    def solid(self) -> Solids:
+        """The obstacle as arrays, with its motion."""
+        ways, times = self.moves_and_times
+        return records.one_solid(self.solid_at_rest, times, ways, self.lifetime)
 
     @property
     def undisplaced_centre(self) -> Any:
@@ -117,7 +109,7 @@ class Box(Moving):
     @property
     def box_bounds(self) -> tuple[float, ...] | None:
         """Lowest and highest corner (6,) [m]; None if the box is turned or moves."""
-        if self.is_turned or len(self.moves_and_times[1]):
+        if self.is_turned or self.solid.moves:
             return None
         return (*self.min, *self.max)
 
@@ -236,7 +228,7 @@ OBSTACLE_KINDS: dict[str, type[Part]] = models_by_kind(Obstacle)
 
 def is_ground(thing: Obstacle) -> bool:
     """Whether an obstacle counts as ground: a ground, and terrain and boxes that are no zones and at rest."""
-    firm = isinstance(thing, Heights | Box) and not thing.zone and not len(thing.moves_and_times[1])
+    firm = isinstance(thing, Heights | Box) and not thing.zone and not thing.solid.moves
     return firm or isinstance(thing, Ground)
 
 
@@ -281,8 +273,7 @@ def _height_map_rules(m: FindingCollector, thing: Heights, path: Keys) -> Breach
         yield Breach("file", NOT_A_FILE, "load the mission from its file, or give heights")
         return
     if thing.heights is None:
-        if m.is_valid(path, "heights"):
-            yield Breach("heights", "is missing", "add heights, or a file with them")
+        yield Breach("heights", "is missing", "add heights, or a file with them")
         return
     rows = {len(row) for row in thing.heights}
     count = len(thing.heights) * max(rows, default=0)

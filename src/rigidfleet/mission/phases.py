@@ -17,7 +17,6 @@ from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys, suggest
-from rigidfleet.mission.formations import has_no_findings
 from rigidfleet.mission.kinds import (
     ANGLES,
     KINDS,
@@ -44,24 +43,15 @@ _MOST_SAMPLES = 1_000_000
 _MOST_TURNS = 100
 #: Maximum number of values in a result: 4 GB.
 _MOST_NUMBERS = 5e8
-#: The phases as written, with None for each that is not valid; the greatest duration [s] of each, None if unknown.
+#: The phases as written, with None for each that is not valid.
 Written = Sequence[Any]
-Durations = list[float | None]
 
 
 def phase_rules(m: Draft) -> Breaches:
     """All phases, by themselves and together; they are parts of the mission, including those with findings."""
     phases = yield from _validate_phases(m)
     m.parts["phases"] = tuple(p for p in phases if p is not None)
-    _check_phases(m, phases)
-    end = latest_end_of_phases(m.phases) if m.is_valid((), "phases") else math.nan
-    # With automatic durations it is not known; the mission is checked again when they are.
-    m.end = None if math.isnan(end) else end
-
-
-def _check_phases(m: Draft, phases: Written) -> None:
-    """Check phases together, then each with what it needs."""
-    durations: Durations = [None] * len(phases)
+    durations = [math.nan] * len(phases)
     m.record_breaches(("phases",), _phase_name_rules(phases))
     m.record_breaches((), _phase_ending_rules(m, phases, durations))
     for k, p in enumerate(phases):
@@ -81,6 +71,9 @@ def _check_phases(m: Draft, phases: Written) -> None:
                 _automatic_time_rules(m, p, k),
             ):
                 m.record_breaches(("phases", k), rules)
+    if m.is_valid((), "phases"):
+        # With automatic durations it is not known; the mission is checked again when they are.
+        m.end = latest_end_of_phases(m.phases)
 
 
 def latest_end_of_phases(phases: Sequence[AnyPhase]) -> float:
@@ -117,63 +110,58 @@ def _phase_name_rules(phases: Written) -> Breaches:
     seen: dict[str, int] = {}
     for k, p in enumerate(phases):
         first = seen.setdefault(p.name, k) if p is not None else k
-        if p is not None and first != k:
+        if first != k:
             problem = f"is also the name of phase {first + 1}"
             yield Breach((k, "name"), problem, "give each phase its own name", p.name)
 
 
-def _phase_ending_rules(m: Draft, phases: Written, durations: Durations) -> Breaches:
+def _phase_ending_rules(m: Draft, phases: Written, durations: list[float]) -> Breaches:
     """Each phase has one ending, and ends increase; notes the greatest ``durations`` of phases."""
-    first: float | None = 0.0  # earliest and latest start of the phase; None if unknown
-    last: float | None = 0.0
+    first = last = 0.0  # earliest and latest start of the phase; nan if unknown
     for k, p in enumerate(phases):
         path = ("phases", k)
-        if p is None or not m.is_valid(path, *_ENDINGS):
-            first = last = None
-            continue
-        endings = [e for e in _ENDINGS if getattr(p, e) is not None]
+        valid = p is not None and m.is_valid(path, *_ENDINGS)
+        endings = [e for e in _ENDINGS if getattr(p, e) is not None] if valid else []
         if len(endings) != 1:
-            problem = f"has two endings, {' and '.join(endings)}" if endings else "has no ending"
-            remedy = f"give exactly one of {', '.join(_ENDINGS)} (until is a mission time)"
-            yield Breach(path, problem, remedy, p.name)
-            first = last = None
+            if valid:
+                problem = (
+                    f"has two endings, {' and '.join(endings)}" if endings else "has no ending"
+                )
+                remedy = f"give exactly one of {', '.join(_ENDINGS)} (until is a mission time)"
+                yield Breach(path, problem, remedy, p.name)
+            first = last = math.nan
             continue
-        longest: Any = p.duration
         if p.until is not None:
-            if first is not None and last is not None:
-                longest = p.until - first
-                if p.until <= first:
-                    problem = f"the phase would end before it starts at {first:g} s"
-                    remedy = "until is a mission time that increases from phase to phase; duration is a length of time"
-                    yield Breach((*path, "until"), problem, remedy)
-                elif p.until <= last:
-                    problem = f"the phase may start as late as {last:g} s, when an earlier phase takes long to settle"
-                    remedy = "end it by duration, or reduce the timeout of the earlier phase"
-                    yield Breach((*path, "until"), problem, remedy)
+            durations[k] = p.until - first
+            if p.until <= first:
+                problem = f"the phase would end before it starts at {first:g} s"
+                remedy = "until is a mission time that increases from phase to phase; duration is a length of time"
+                yield Breach((*path, "until"), problem, remedy)
+            elif p.until <= last:
+                problem = f"the phase may start as late as {last:g} s, when an earlier phase takes long to settle"
+                remedy = "end it by duration, or reduce the timeout of the earlier phase"
+                yield Breach((*path, "until"), problem, remedy)
             first = last = p.until
-        else:
-            if p.settle is not None:
-                longest = p.settle.timeout
-                if p.settle.timeout <= p.settle.dwell:
-                    problem = "times out before dwell has passed"
-                    yield Breach((*path, "settle"), problem, "give a timeout longer than dwell")
-            if longest == AUTO:
-                first = last = longest = None
-            shortest = p.settle.dwell if p.settle is not None else longest
-            first = first + (shortest or 0.0) if first is not None else None
-            last = last + (longest or 0.0) if last is not None else None
+            continue
+        shortest = longest = seconds(p.duration or 0.0)
+        if p.settle is not None:
+            shortest, longest = p.settle.dwell, p.settle.timeout
+            if longest <= shortest:
+                problem = "times out before dwell has passed"
+                yield Breach((*path, "settle"), problem, "give a timeout longer than dwell")
         durations[k] = longest
+        first, last = first + shortest, last + longest
     yield from _sample_count_rules(m, last)
 
 
-def _motion_time_rules(m: Draft, p: Phase, k: int, duration: float | None) -> Breaches:
+def _motion_time_rules(m: Draft, p: Phase, k: int, duration: float) -> Breaches:
     """The travel or blend of a phase is not longer than the phase."""
     lasts = p.least_time
     if not m.is_valid(("phases", k), "reference", *_ENDINGS):
         return
     if p.shaping is not None and p.shaping.reference == "step":
         yield from unused_key_rules(p, "blend", "reference", "shape")
-    elif duration is None or p.follows_curves or not lasts > duration * (1 + 1e-9):
+    elif p.follows_curves or not lasts > duration * (1 + 1e-9):
         return
     elif p.time_key == "blend":
         problem = f"is longer than the phase, which lasts {duration:g} s"
@@ -193,10 +181,10 @@ def _estimate_numbers_per_sample(m: Draft, n: int) -> int:
     return 30 * n + 8 * edges + 50
 
 
-def _sample_count_rules(m: Draft, end: float | None) -> Breaches:
+def _sample_count_rules(m: Draft, end: float) -> Breaches:
     """A result has samples, and not too many."""
     step, n = m.output_step, m.n or 0
-    if not end or not m.is_valid((), "output_step", "formations"):
+    if not end > 0.0 or not m.is_valid((), "output_step", "formations"):
         return
     switches = 2 * len(m.tables("phases"))  # one sample per step, and two at each change of phase
     samples = end / step + switches
@@ -236,17 +224,17 @@ def _control_rules(m: Draft, p: Phase) -> Breaches:
 
 
 # -- rules of single kinds ---------------------------------------------------------------------------
-# Arguments: the mission, the phase, its number from 0, its greatest duration [s] or None.
+# Arguments: the mission, the phase, its number from 0, its greatest duration [s], nan if unknown.
 
 
-def _turn_rules(m: Draft, p: Turn, k: int, _: float | None) -> Breaches:
+def _turn_rules(m: Draft, p: Turn, k: int, _: float) -> Breaches:
     """A turn has a target angle."""
     if p.attitude_deg is None and m.is_valid(("phases", k), *ANGLES):
         remedy = f"give at least one of {', '.join(reversed(ANGLES))}"
         yield Breach((), "has no target angle", remedy, p.name)
 
 
-def _establish_rules(m: Draft, p: Establish, k: int, _: float | None) -> Breaches:
+def _establish_rules(m: Draft, p: Establish, k: int, _: float) -> Breaches:
     """A commanded attitude has an effect."""
     if not m.is_valid(("phases", k), "attitude", *ANGLES):
         return
@@ -262,13 +250,13 @@ def _establish_rules(m: Draft, p: Establish, k: int, _: float | None) -> Breache
         yield Breach([*angles, "attitude"][0], problem, remedy)
 
 
-def _orbit_rules(m: Draft, p: Orbit, k: int, duration: float | None) -> Breaches:
+def _orbit_rules(m: Draft, p: Orbit, k: int, duration: float) -> Breaches:
     """An orbit has tracked slots, a rate within bounds, and an end."""
     yield from _tracked_way_rules(m, p, k, duration)
     if not m.is_valid(("phases", k), "radius"):
         return
     rate = abs(np.deg2rad(p.rate_deg_s))
-    turns = rate * (duration or 0.0) / (2 * np.pi)
+    turns = rate * duration / (2 * np.pi)
     if rate == 0.0:
         yield Breach("rate_deg_s", "must not be 0", "give a rate, or use kind = 'fly' or 'hold'")
     elif p.radius * rate > bounds.SPEED.most or p.radius * rate**2 > bounds.ACCELERATION.most:
@@ -279,7 +267,7 @@ def _orbit_rules(m: Draft, p: Orbit, k: int, duration: float | None) -> Breaches
         yield Breach("rate_deg_s", problem, "use a lower rate or several phases")
 
 
-def _tracked_way_rules(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
+def _tracked_way_rules(m: Draft, p: Phase, k: int, _: float) -> Breaches:
     """A phase with a way of its own has tracked slots and a time of arrival."""
     if p.leads_body:
         problem = f"kind '{p.kind}' cannot be flown by a wrench on the virtual body"
@@ -289,7 +277,7 @@ def _tracked_way_rules(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
         yield Breach("settle", problem, "end it by duration or until", None)
 
 
-def _vertical_rules(m: Draft, p: Any, k: int, duration: float | None) -> Breaches:
+def _vertical_rules(m: Draft, p: Any, k: int, duration: float) -> Breaches:
     """A take-off or a landing has what its groups need, and agents that exist."""
     yield from _tracked_way_rules(m, p, k, duration)
     if p.lands and p.places == "own" and (p.agents or p.stagger or p.travel or p.until):
@@ -308,7 +296,7 @@ def _vertical_rules(m: Draft, p: Any, k: int, duration: float | None) -> Breache
     yield from named_agent_rules(m, p.agents, "agents")
 
 
-def _go_rules(m: Draft, p: Go, k: int, duration: float | None) -> Breaches:
+def _go_rules(m: Draft, p: Go, k: int, duration: float) -> Breaches:
     """A way can be found and flown: tracked slots, an end, and formations that exist."""
     yield from _tracked_way_rules(m, p, k, duration)
     for name in p.formations or ():
@@ -319,7 +307,7 @@ def _go_rules(m: Draft, p: Go, k: int, duration: float | None) -> Breaches:
 _JUMPS = ((0.01, "m"), (0.1, "m/s"))
 
 
-def _follow_rules(m: Draft, p: Follow, k: int, duration: float | None) -> Breaches:
+def _follow_rules(m: Draft, p: Follow, k: int, duration: float) -> Breaches:
     """There are trajectories, without jumps, one for the virtual body or one for each vehicle, and an end."""
     yield from _tracked_way_rules(m, p, k, duration)
     if p.trajectories is None:
@@ -365,7 +353,7 @@ def _follow_rules(m: Draft, p: Follow, k: int, duration: float | None) -> Breach
                 remedy = f"correct it: at most {most:g} {unit} is taken for rounding"
                 yield Breach(("trajectories", i), problem, remedy, None)
                 return
-    if p.travel and p.settle is None and duration is not None and duration > p.travel * (1 + 1e-9):
+    if p.travel and p.settle is None and duration > p.travel * (1 + 1e-9):
         # Beyond the file the body goes on as it ends, and the vehicles rest beside each other.
         v = way.states(way.time[-1:], 2)[1, 0, :, :3] * (way.time[-1] / p.travel)
         mass = () if m.agents is None else m.agents.mass
@@ -377,7 +365,7 @@ def _follow_rules(m: Draft, p: Follow, k: int, duration: float | None) -> Breach
             yield Breach("travel", f"ends before the phase, while {who}", remedy, p.travel)
 
 
-def _reshape_rules(m: Draft, p: Reshape, k: int, _: float | None) -> Breaches:
+def _reshape_rules(m: Draft, p: Reshape, k: int, _: float) -> Breaches:
     """Ways other than straight ones can be found and flown, or are given, and nothing else bends them."""
     rows, n = p.control_points, m.n
     if rows is not None and n is not None:
@@ -403,7 +391,7 @@ def _reshape_rules(m: Draft, p: Reshape, k: int, _: float | None) -> Breaches:
         yield Breach("transition", problem, "use duration = 'auto', too")
 
 
-_OWN: dict[str, Callable[[Draft, Any, int, float | None], Breaches]] = {
+_OWN: dict[str, Callable[[Draft, Any, int, float], Breaches]] = {
     "brake": _tracked_way_rules,
     "establish": _establish_rules,
     "follow": _follow_rules,
@@ -431,6 +419,7 @@ def named_agent_rules(m: Draft, agents: Sequence[int], *where: str) -> Breaches:
 def _formation_use_rules(m: Draft, phases: Written) -> Breaches:
     """Formations exist and can be blended to, tracked and reached."""
     forms: Mapping[str, Formation] = m.formations
+    n, sound = m.n or 0, {name: x for name, x in forms.items() if m.is_valid(("formations",), name)}
     held: str | None = ""  # name of the formation held; "": initial positions; None: unknown
     slotted: set[str] = set()  # names of formations that have slots to track
     for k, p in enumerate(phases):
@@ -450,14 +439,14 @@ def _formation_use_rules(m: Draft, phases: Written) -> Breaches:
                 problem = f"formation '{shaping.formation}' is given by distances alone, which have no axes"
                 remedy = "remove it, give the formation slots, or command an attitude by yaw_deg"
                 yield Breach((*path, "attitude"), problem, remedy)
-            if m.n is not None and form is not None and has_no_findings(m, shaping.formation):
-                yield from _slot_blend_rules(shaping, form, m.n, path)
+            if n and shaping.formation in sound:
+                yield from _slot_blend_rules(shaping, sound[shaping.formation], n, path)
             held = shaping.formation
-        form = forms.get(held) if held else None
+        form = sound.get(held) if held else None
         tracked = p.tracks_slots and held not in slotted and m.is_valid(path, "control")
-        if not tracked or m.n is None or form is None or not held or not has_no_findings(m, held):
+        if not tracked or not n or form is None or not held:
             continue
-        if form.distances is not None and form.slot_array(m.n) is None:
+        if form.distances is not None and form.slot_array(n) is None:
             problem = f"formation '{held}' has no slots to track"
             remedy = f"give formations.{toml_key(held)} a shape or slots, or change control"
             yield Breach((*path, "control"), problem, remedy, p.control)

@@ -6,6 +6,7 @@ rules of their tables; `Draft.record_breaches` is the one place that records wha
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -48,14 +49,14 @@ class Draft(FindingCollector):
     ----------
     parts : what has been validated, by the fields of `rigidfleet.mission.schema.Contents`
     n : number of agents; None if it is not known
-    end : mission time [s] at which the last phase ends at the latest; None if it is not known
+    end : mission time [s] at which the last phase ends at the latest; nan if it is not known
     """
 
     def __init__(self, data: Mapping[str, Any], origin: str, defaults: Mapping[str, Any]) -> None:
         super().__init__(data, origin)
         self.parts: dict[str, Any] = {}
         self.n: int | None = None
-        self.end: float | None = None
+        self.end = math.nan
         self._defaults = defaults
 
     def __getattr__(self, name: str) -> Any:

@@ -117,6 +117,4 @@ def parse_toml(text: str, origin: str) -> dict[str, Any]:
     except ValueError as error:  # a number of thousands of digits
         problem = f"cannot be read as TOML: {error}"
         remedy = "correct it; toml.io describes the format"
-    except RecursionError:
-        problem, remedy = "is nested too deeply", "use the keys of a mission"
     raise text_error(origin, problem, remedy)

@@ -64,21 +64,15 @@ _T = TypeVar("_T")
 _Other = TypeVar("_Other")
 
 
-def _list_discriminator(value: object) -> str:
-    return "list" if isinstance(value, list | tuple) else "one"
-
-
-def _word_discriminator(value: object) -> str:
-    return "word" if isinstance(value, str) else "one"
-
-
 #: One value, or a list in its place; one value, or as many as there are agents; a value, or a word in its place.
 _OneOrList = Annotated[
-    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("list")], Discriminator(_list_discriminator)
+    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("list")],
+    Discriminator(lambda value: "list" if isinstance(value, list | tuple) else "one"),
 ]
 _PerAgent = _OneOrList[_T, tuple[_T, ...]]
 _ValueOrWord = Annotated[
-    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("word")], Discriminator(_word_discriminator)
+    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("word")],
+    Discriminator(lambda value: "word" if isinstance(value, str) else "one"),
 ]
 _Two, _Three = (Field(min_length=n, max_length=n) for n in (2, 3))
 #: A place [x, y] as it is seen from above.

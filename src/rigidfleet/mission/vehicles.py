@@ -79,16 +79,11 @@ class VehicleModel(NamedTuple):
         return (across, across, along)
 
 
-def _parameters_and_sources() -> dict[str, dict[str, tuple[Any, str]]]:
-    """The numbers of each model by key, each with its source."""
-    tables = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-    for table in tables.values():
-        for key, (number, source) in table.items():
-            table[key] = (tuple(number) if isinstance(number, list) else number), source
-    return tables
-
-
-MODELS = _parameters_and_sources()
+#: The numbers of each model by key, each with its source.
+MODELS: dict[str, dict[str, tuple[Any, str]]] = {
+    name: {key: (tuple(x) if isinstance(x, list) else x, why) for key, (x, why) in table.items()}
+    for name, table in tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8")).items()
+}
 
 #: Keys that only a point has, and those of a quadrotor in their place.
 _OF_POINTS = {"thrust_limit": "thrust_coefficient", "drag": "rotor_drag"}
@@ -173,15 +168,16 @@ def fill_agents_table(m: Draft, agents: Any) -> Any:
             m.add(("vehicles",), problem, f"add vehicle = {names} to [agents]", None)
         return agents
     written, tables = agents["vehicle"], m.data.get("vehicles", {})
-    n = len(agents["position"]) if isinstance(agents.get("position"), list) else 0
-    names = [written] * n if isinstance(written, str) else written
+    names = [written] * (m.n or 1) if isinstance(written, str) else written
     where = ("agents", "vehicle")
     if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
         m.add(where, "is not a name or a list of names", 'write vehicle = "NAME"')
         return None
-    if len(names) != n:
-        problem = f"has {len(names)} entries for {n} agents"
-        m.add(where, problem, f"give one name, or {n}", None)
+    if m.n is None:  # the model says what is wrong with the positions
+        return agents | {"vehicle": names, "mass": [1.0]}
+    if len(names) != m.n:
+        problem = f"has {len(names)} entries for {m.n} agents"
+        m.add(where, problem, f"give one name, or {m.n}", None)
         return None
     known = tables if isinstance(tables, dict) else {}
     for name in dict.fromkeys(names):
@@ -203,12 +199,11 @@ def fill_agents_table(m: Draft, agents: Any) -> Any:
     if not set(names) <= set(m.vehicles):
         return None  # has errors of its own
     models = {name: model_of_vehicle(m.vehicles[name]) for name in set(names)}
-    own = {
+    return agents | {
         "vehicle": names,
         "mass": [models[name].mass for name in names],
         "thrust_limit": [models[name].thrust_limit for name in names],
     }
-    return {key: value for key, value in agents.items() if key != "saturate"} | own
 
 
 #: Problem and remedy of what points without sampled control cannot have.

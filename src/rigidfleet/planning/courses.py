@@ -160,7 +160,7 @@ def _vertical_course(mission: Mission, phase: Vertical, now: PhaseState, t_end: 
             travel = min(phase.travel or math.inf, t_end - now.t)
             lift = Lift(np.outer(rise - up[2], before.T[:, 2]), travel)
     else:
-        up[2] = -max(0.0, height_above_landing(mission, now))
+        up[2] = -max(0.0, height_above_landing(mission, phase, now))
         v[2] = -min(LANDING_SPEED, -up[2] / (arrival - now.t))
     goal = copy_with(before, r=before.r + up, v=v, omega=np.zeros(3))
     return Course(goal, arrival, partial(smooth_motion, pose, goal, now.t, arrival), lift)
@@ -272,7 +272,7 @@ def _trajectory_conflict_text(phase: Follow, now: PhaseState) -> str:
 def climb_distances(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     """How far [m] each vehicle (N,) goes up from the pose to hold: to a height, or (down) to just above the ground."""
     (_, goal, slots), n = now.pose_goal_and_slots, mission.n_agents
-    place, ground = goal.r[2] + slots @ goal.T[:, 2], _surface_heights_below_goal(mission, now)
+    place, ground = goal.r[2] + slots @ goal.T[:, 2], _heights_below_goal(mission, phase, now)
     if phase.arrival_height is None:
         up = np.minimum(ground + (ABOVE + mission.fleet.radius) - place, 0.0)
     else:
@@ -281,7 +281,7 @@ def climb_distances(mission: Mission, phase: Vertical, now: PhaseState) -> Float
     return np.where(goes & ~now.lost, up, 0.0)
 
 
-def _surface_heights_below_goal(mission: Mission, now: PhaseState) -> Floats:
+def _heights_below_goal(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     """Height (N,) [m] of what is below each vehicle at the pose to hold; of a lost one, the least of the others'.
 
     Raises
@@ -296,15 +296,18 @@ def _surface_heights_below_goal(mission: Mission, now: PhaseState) -> Floats:
         x, y, _ = r[off[0]]
         problem = f"needs a ground, and none is below agent {off[0] + 1} at ({x:.1f}, {y:.1f}) m"
         remedy = "add [[obstacles]] with kind = 'ground', or more terrain"
-        raise MissionError([Finding(mission.origin, "phases", None, problem, remedy)])
+        names = [p.name for p in mission.phases]  # a landing after a loss has no number there
+        number = f"[{names.index(phase.name) + 1}]" if phase.name in names else ""
+        where = f"phases{number}.kind"
+        raise MissionError([Finding(mission.origin, where, None, problem, remedy)])
     return np.where(now.lost, heights[~now.lost].min(), heights)
 
 
-def height_above_landing(mission: Mission, now: PhaseState) -> float:
+def height_above_landing(mission: Mission, phase: Vertical, now: PhaseState) -> float:
     """How far [m] the lowest vehicle is above the height at which a landing ends, at the pose to hold."""
     _, goal, slots = now.pose_goal_and_slots
     below = goal.r[2] + slots @ goal.T[:, 2] - mission.fleet.radius
-    return float(below[~now.lost].min() - _surface_heights_below_goal(mission, now).min()) - ABOVE
+    return float(below[~now.lost].min() - _heights_below_goal(mission, phase, now).min()) - ABOVE
 
 
 def _course_to(

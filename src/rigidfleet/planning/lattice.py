@@ -21,6 +21,7 @@ import numpy as np
 
 from rigidfleet.math import proximity
 from rigidfleet.mission import Obstacle
+from rigidfleet.mission.obstacles import Ground
 from rigidfleet.solids import records
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -32,6 +33,8 @@ SPARE = 0.005
 _MOST = 26
 #: What a metre aside of the straight way counts, where ways are compared by their room [m].
 _ASIDE = 1e-5
+#: Places of a motion, both ends included, at which it is looked for what stands in the way.
+_LOOKED_AT = 5
 #: How often a way is shortened.
 _SHORTER = 3
 #: Costs, as lengths: of a change in multiples of its longest way plus a length [m]; of a way in another shape.
@@ -343,17 +346,28 @@ class Roadmap:
         return [stops[0], *further]
 
     def _motion_clearances(self) -> Iterator[tuple[Ints, Ints, Floats]]:
-        """Nodes of the world's lattice that a motion or a change joins, proved or not, and the room there [m]."""
+        """Nodes of the world's lattice that a motion or a change joins, proved or not, and the room there [m].
+
+        Nodes above the ground alone: no way leads round it, below the walls that stand on it.
+        """
         row, first = self.lattices[0], self.first[0]
+        grounds = (x.height for x in self.space.obstacles if isinstance(x, Ground))
+        lowest = max(grounds, default=-np.inf) + self.need
+        above = []
+        for x in row:
+            bottom = (x.layer.offsets[:, 2] - self.radius).min()
+            above.append(x.points[:, 2] + bottom >= lowest)
         for k, x in enumerate(row):
-            a, b = x.all_edges
-            share = np.linspace(0.0, 1.0, 5)[1:-1]
+            a, b = x.all_edges[:, above[k][x.all_edges].all(axis=0)]
+            share = np.linspace(0.0, 1.0, _LOOKED_AT)[1:-1]
             between = x.points[a, None] + share[:, None] * (x.points[b] - x.points[a])[:, None]
             room = self.space.clearance(between[:, :, None] + x.layer.offsets, self.radius)
             ends = np.minimum(x.room[a], x.room[b])
             yield a + first[k], b + first[k], np.minimum(room.min(axis=(1, 2)), ends)
         for change in self.changes:
-            (a, one), (b, two) = ((row[k].common, row[k]) for k in (change.before, change.after))
+            one, two = row[change.before], row[change.after]
+            both = above[change.before][one.common] & above[change.after][two.common]
+            a, b = one.common[both], two.common[both]
             room = np.minimum(one.room[a], two.room[b])
             yield a + first[change.before], b + first[change.after], room
 
@@ -374,8 +388,15 @@ class Roadmap:
         a, b = self.node_at(*begin), self.node_at(*end)
         _, before = breadth_first_order(tree, a, directed=False)
         tree = (tree + tree.T).tocsr()
-        at, least = b, (np.inf, b)
+        at, least = b, (np.inf, b, b)
         while at != a:
-            least = min(least, (most - float(tree[at, before[at]]), at))
-            at = int(before[at])
-        return least[0], self.points[least[1]], int(self.layer_of[least[1]])
+            after, at = at, int(before[at])
+            least = min(least, (most - float(tree[after, at]), after, at))
+        room, *ends = least
+        line = np.linspace(*self.points[ends], _LOOKED_AT)[:, None]
+        rooms = {
+            layer: self.space.clearance(line + self.layers[layer].offsets, self.radius).min(axis=1)
+            for layer in self.layer_of[ends].tolist()
+        }
+        layer = min(rooms, key=lambda layer: rooms[layer].min())
+        return room, line[rooms[layer].argmin(), 0], layer

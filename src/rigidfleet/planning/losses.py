@@ -136,7 +136,7 @@ def loss_legs(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg
     each = partial(land, agents=everyone)
     ways = [(each, -float(climb_distances(mission, each(duration=1.0), now).min()))]
     if shaped:  # together, unless something is below some
-        ways.insert(0, (land, height_above_landing(mission, now)))
+        ways.insert(0, (land, height_above_landing(mission, land(duration=1.0), now)))
     for make, depth in ways:
         if depth <= 0.0:
             return legs

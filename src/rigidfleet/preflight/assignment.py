@@ -24,10 +24,10 @@ def assignment_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
     if first is None or slots is None or not 2 <= mission.n_agents <= _COMPARED:
         return
     index, masses = mission.phases.index(first), mission.fleet.mass
-    if index >= len(preflight.planned_phases):
+    if index >= len(preflight.flown_phases):
         return
     for name in ("as it is", "shortest", "safe"):
-        other, planned = mission, preflight.planned_phases[index]
+        other, planned = mission, preflight.flown_phases[index]
         if name not in ("as it is", mission.assignment):
             other = mission.with_assignment(name)
             planned = preview_phases(other, index + 1)[0][index]
@@ -38,14 +38,13 @@ def assignment_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         clearance = assignment.closest_approach(*planned.path_ends, mission.agents.radius)[0]
         order = tuple((other.assigned_slots[first.formation] + 1).tolist())
         preflight.assignments[name] = Assignment(order, length, clearance)
-    radius = mission.fleet.radius
     now, short, safe = preflight.assignments.values()
     before, after = now.path_length_m, short.path_length_m
     if after < (1 - _WORTH) * before - _SHORT:
         text = f'assignment = "shortest" reduces the total path length from {before:.1f} m to {after:.1f} m'
         yield Remark("note", "assignment", text)
     before, after = now.min_clearance_m, safe.min_clearance_m
-    if after > before + 0.05 and before < 2 * radius.max():
+    if after > before + 0.05 and before < 2 * mission.fleet.radius.max():
         what = "increases the minimum clearance on the paths"
         text = f'assignment = "safe" {what} from {before:.2f} m to {after:.2f} m'
         yield Remark("note", "assignment", text)

@@ -58,7 +58,8 @@ def check(
     progress("planned paths")
     planned, known = preview_phases(mission)
     flown, rest = parts_before_and_after_loss(mission, planned)
-    preflight = Preflight(mission, formations, check_pid_gains(mission, formations), flown)
+    gains = check_pid_gains(mission, formations)
+    preflight = Preflight(mission, formations, gains, planned, flown)
     trajectory.find_planned_peaks(mission, preflight)
     if not known:
         preflight.judged_to = float(planned[-1].time[-1]) if planned else 0.0
@@ -87,9 +88,8 @@ def check(
         *area_remarks(mission, preflight),
         *trajectory.limit_remarks(mission, preflight),
         *trajectory.waypoint_miss_remarks(mission, preflight),
-        *loss_remarks(mission, preflight, planned, rest),
+        *loss_remarks(mission, preflight, rest),
     ]
-    preflight.planned_phases = planned
     if planned and not rest and (words := mission.landing_swaps_in_words(planned[-1].position[-1])):
         preflight.remarks.append(Remark("note", "landing", words))
     if not known:
@@ -98,7 +98,7 @@ def check(
             why = "more agents and phases would take too long"
         text = f"paths are checked only up to {preflight.judged_to:g} s: {why}"
         preflight.remarks.append(Remark("note", "paths", text))
-    if any(planned.leg.phase.leads_body for planned in preflight.planned_phases):
+    if any(x.leg.phase.leads_body for x in planned):
         text = "paths in phases with control = 'body' are estimates, less close the faster the formation turns"
         preflight.remarks.append(Remark("note", "paths", text))
     return preflight

@@ -52,6 +52,8 @@ _FORCES = {
 }  # fmt: skip
 
 Level = Literal["fails", "note"]
+#: What holds a formation in the phases that have it.
+HeldBy = Literal["tracking", "distances", "nothing"]
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ class FormationCheck:
 
     name: str
     rigidity: Rigidity | None
-    held_by: Literal["tracking", "distances", "nothing"]
+    held_by: HeldBy
     realisations: Realisations | None = None
     solve: solvers.Method = "dense"
     spectrum: Spectrum | None = None
@@ -175,10 +177,6 @@ class MarginsCheck:
         for where, f in self.formations.items():
             rows.append(_margin_row(where, f.margins) | {"p up to [/s]": f.largest_pole})
         return table_of(rows, ("", "margins"))
-
-    def data(self) -> dict[str, Any]:
-        """Plain data for JSON."""
-        return {"tracking": self.tracking, "formations": self.formations}
 
 
 @dataclass(frozen=True)
@@ -312,6 +310,7 @@ class Preflight(Shown):
     mission : with its times known
     formations, gains : checks of the formations and of the constraint law
     planned_phases : planned paths of each phase
+    flown_phases : what of them is flown, up to a loss that is answered or an abort: what is judged
     worst : by quantity, the planned value nearest to its limit: the value, its time [s], whose it is, and the limit,
         which is None or infinite if there is none
     clearance : of each obstacle: its name, minimum clearance [m], time [s], agent
@@ -337,6 +336,7 @@ class Preflight(Shown):
     formations: list[FormationCheck]
     gains: GainsCheck
     planned_phases: list[PlannedPhase]
+    flown_phases: list[PlannedPhase]
     worst: dict[str, Any] = field(default_factory=lambda: dict.fromkeys(WORST_SHOWN))
     clearance: list[tuple[str, float, float, str]] = field(default_factory=list)
     gaps: list[tuple[str, float, float, float]] = field(default_factory=list)

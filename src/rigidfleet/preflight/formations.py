@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
 from rigidfleet.planning.reference import reference_kind
-from rigidfleet.preflight.findings import DENSE, FormationCheck, Remark, names_with_verb
+from rigidfleet.preflight.findings import DENSE, FormationCheck, HeldBy, Remark, names_with_verb
 from rigidfleet.rigidity import (
     Kind,
     Rigidity,
@@ -32,7 +31,6 @@ from rigidfleet.rigidity.realisations import deform_to_lengths
 from rigidfleet.rigidity.spectrum import MOST_FACTORED as LANCZOS
 from rigidfleet.typing import Floats
 
-_Held = Literal["tracking", "distances", "nothing"]
 #: Remarks on formations, by their text.
 _note, _fails = partial(Remark, "note", "formation"), partial(Remark, "fails", "formation")
 #: Maximum number of agents for which other shapes with the same distances are searched by default.
@@ -58,8 +56,7 @@ def check_formations(
         work = _formation_check_time(mission, name, search=search)
         skipped = k > 1 and work > left
         left -= 0.0 if skipped else work
-        check = _check_formation(mission, name, held[name], search=search, skipped=skipped)
-        checks[name] = check
+        checks[name] = _check_formation(mission, name, held[name], search=search, skipped=skipped)
     return [checks[name] for name in mission.formations]
 
 
@@ -72,7 +69,7 @@ def _formation_check_time(mission: Mission, name: str, *, search: bool) -> float
 
 
 def _check_formation(
-    mission: Mission, name: str, held: _Held, *, search: bool, skipped: bool
+    mission: Mission, name: str, held: HeldBy, *, search: bool, skipped: bool
 ) -> FormationCheck:
     """The rigidity, or the spectrum of a large formation, and other shapes if they are searched.
 
@@ -105,7 +102,7 @@ def _check_formation(
     return replace(check, realisations=others)
 
 
-def _formation_control(mission: Mission, name: str) -> _Held:
+def _formation_control(mission: Mission, name: str) -> HeldBy:
     """What holds a formation in the phases that have it."""
     now, tracks = None, set()
     for phase in mission.phases:

@@ -44,14 +44,11 @@ def parts_before_and_after_loss(
 
 
 def loss_remarks(
-    mission: Mission,
-    preflight: Preflight,
-    planned: Sequence[PlannedPhase],
-    rest: list[PlannedPhase],
+    mission: Mission, preflight: Preflight, rest: list[PlannedPhase]
 ) -> Iterator[Remark]:
     """Remarks on lost links, and on the way of those left after the first loss.
 
-    Of the phases ``planned``, the ``rest`` is not flown: notes say what would fail.
+    The ``rest`` of the planned phases is not flown: notes say what would fail.
     """
     yield from _lost_link_remarks(mission)
     first = mission.abandons_at
@@ -61,7 +58,7 @@ def loss_remarks(
         if remark.level == "fails":
             text = f"{remark.text}. The flight leaves its plan before, at {first:g} s"
             yield Remark("note", remark.topic, text)
-    legs = [phase.leg for phase in planned]
+    legs = [phase.leg for phase in preflight.planned_phases]
     at = next((x for x in legs if x.start < first <= x.end), None)
     ordered = mission.aborts and mission.on_loss == "continue"
     if at is None:
@@ -95,7 +92,7 @@ def _path_remarks(
     mission: Mission, preflight: Preflight, planned: list[PlannedPhase]
 ) -> Iterator[Remark]:
     """Remarks on the paths of phases that are planned beside those of the flight."""
-    part = Preflight(mission, preflight.formations, preflight.gains, planned)
+    part = Preflight(mission, preflight.formations, preflight.gains, planned, planned)
     for judge in (
         separation_remarks, downwash_remarks, obstacle_remarks, area_remarks, limit_remarks,
     ):  # fmt: skip

@@ -259,7 +259,7 @@ def growth_rates_of_trials(flight: LinearFlight, net: Links, every: int) -> Floa
 
 def network_remarks(preflight: Preflight) -> Iterator[Remark]:
     """Remarks on formations whose network is beyond what they bear, or was not checked."""
-    mission, planned = preflight.mission, preflight.planned_phases
+    mission, planned = preflight.mission, preflight.flown_phases
     for name in dict.fromkeys(name for p in planned if (name := p.leg.formation) is not None):
         unchecked = mission.network is not None and name not in preflight.network
         if unchecked and len(mission.formation_edges(name)):

@@ -29,7 +29,7 @@ _NEAREST = 20
 
 def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on hit obstacles. Clearances of many obstacles are computed for the near ones only."""
-    radius, way = mission.fleet.radius, preflight.planned_phases
+    radius, way = mission.fleet.radius, preflight.flown_phases
     if not (mission.obstacles and way):
         return
     # Bounding box of each phase, and a lower bound (L, B) of its distance to each obstacle.
@@ -47,7 +47,7 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
         thing = mission.obstacles[b]
         if rank >= _NEAREST and far[:, b].min() > 0:
             break
-        worst: dict[bool, tuple[float, float, int, str]] = {}
+        worst = dict[bool, tuple[float, float, int, str]]()
         for k in np.argsort(far[:, b], kind="stable").tolist():
             planned = way[k]
             if far[k, b] >= worst.get(planned.exact, (np.inf,))[0]:
@@ -64,8 +64,7 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
         if compared > _COMPARED:
             skipped = near[rank:][far[:, near[rank:]].min(axis=0) <= 0].tolist()
             break
-        if worst:
-            shown[b] = worst
+        shown[b] = worst
     for b in sorted(shown):
         thing, (clearance, t, i, _) = mission.obstacles[b], min(shown[b].values())
         preflight.clearance.append((thing.name, clearance, t, f"agent {i + 1}"))
@@ -100,7 +99,7 @@ def area_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     Between samples of a plan, its paths are quintics through positions, velocities and accelerations.
     """
     watch, worst = BoundaryWatch(mission), dict[tuple[str, bool], tuple[Worst, str]]()
-    for planned in preflight.planned_phases if watch.every else ():
+    for planned in preflight.flown_phases if watch.every else ():
         states = np.stack([planned.position, planned.velocity, planned.acceleration])
         watch.add_way(Piecewise.hermite(planned.time, states))
         for name, x in watch.search().items():
@@ -129,7 +128,7 @@ def _least_distance_bound(within: Floats, thing: Obstacle) -> Floats:
 
 def _too_low_in_words(mission: Mission, preflight: Preflight, phase: str, ground: float) -> str:
     """Why a vehicle touches the ground [m] in a phase, and the altitude that its formation needs."""
-    planned = next(planned for planned in preflight.planned_phases if planned.phase == phase)
+    planned = next(planned for planned in preflight.flown_phases if planned.phase == phase)
     masses, radius = mission.fleet.mass, mission.fleet.radius
     z = planned.position[..., 2]
     cm = z @ masses / masses.sum()
@@ -155,7 +154,7 @@ def _box_gap_remarks(mission: Mission, preflight: Preflight, radius: Floats) -> 
     low, high = np.array([box.min for box in boxes]), np.array([box.max for box in boxes])
     least: dict[tuple[int, int, int], tuple[float, float, str]] = {}
     looked, to = 0, math.inf
-    for planned in preflight.planned_phases:
+    for planned in preflight.flown_phases:
         looked += len(planned.time) * len(boxes)
         if looked > _PASSED:
             to = float(planned.time[0])

@@ -113,7 +113,7 @@ def steady_offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Re
     remarks: dict[tuple[str, bool], Remark] = {}
     gusts = 0.0 if preflight.disturbed is None else preflight.disturbed.gusts
     gusts *= 2.0 / 3.0 / (mission.tracking_gains[0] * float(mission.fleet.mass.min()))
-    way, remedy = preflight.planned_phases, ""
+    way, remedy = preflight.flown_phases, ""
     if not mission.tracking.integral:
         remedy = f"; tracking has no integral: raise the first weight in tracking.Q (now {mission.tracking.Q[0]:g})"
         remedy += ", or set tracking.integral" if mission.vehicle_models is not None else ""
@@ -140,10 +140,10 @@ def _broken_limits_in_words(
     """Topic and words of the limits that a planned phase breaks with offsets (K, N, 3) [m]."""
     leg, phase, limits = planned.leg, planned.leg.phase, mission.limits
     masses, r, far = mission.fleet.mass, planned.position + offsets, np.linalg.norm(offsets, axis=2)
-    moved = [replace(planned, position=r, path_ends=None)]
-    there = Preflight(mission, preflight.formations, preflight.gains, moved)
+    moved = replace(planned, position=r, path_ends=None)
+    there = Preflight(mission, preflight.formations, preflight.gains, [moved], [moved])
     remarks = [*separation_remarks(mission, there), *downwash_remarks(mission, there)]
-    remarks += measured_remarks(mission, there.planned_phases[0])
+    remarks += measured_remarks(mission, moved)
     if not phase.lands:  # that ends where vehicles stand
         remarks += obstacle_remarks(mission, there)
     broken = {remark.topic: remark.text for remark in remarks if remark.level == "fails"}
@@ -174,7 +174,7 @@ def _broken_limits_in_words(
         turn = rigid_body.kabsch(r[k], planned.position[k], masses, near=np.eye(3))
         by = float(np.degrees(np.linalg.norm(att.rotation_vector_from_dcm(turn))))
         held.append(("attitude", "", by, WAYPOINT_TOLERANCE["attitude"]))
-    last, name = planned is preflight.planned_phases[-1], leg.planned_end_state.formation
+    last, name = planned is preflight.flown_phases[-1], leg.planned_end_state.formation
     if name and (phase.shaping is not None or last) and 1 < len(masses) <= STACKED:
         # To first order: a turn of the whole changes no distance.
         i, j = proximity.all_pairs(len(masses))

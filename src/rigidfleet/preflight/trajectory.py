@@ -42,7 +42,7 @@ def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
     lowest = mission.limits.separation_altitude
     worst: dict[bool, tuple[_Nearest, str]] = {}
     least: _Nearest = np.inf, 0.0, (0, 0)
-    for number, planned in enumerate(preflight.planned_phases):
+    for number, planned in enumerate(preflight.flown_phases):
         ends: list[_Nearest] = []
         positions = planned.position if planned.path_ends is None else np.array(planned.path_ends)
         # Where separation begins at an altitude, agents below it are left to the verdict.
@@ -102,13 +102,11 @@ def _crossing_remark(mission: Mission, planned: PlannedPhase, at: _Nearest) -> R
     assert planned.path_ends is not None
     least = min(float(proximity.nearest(places).min()) for places in planned.path_ends)
     spaced = f"place slots at least {math.sqrt(2) * needed:.2f} m apart (now {least:.2f} m)"
-    promised = mission.assigned_turn(before, after) is not None
-    if promised:
+    if mission.assigned_turn(before, after) is not None:
         text += f"{spaced[0].upper()}{spaced[1:]}"
     else:
         text += 'Assign agents to near slots: assignment = "each"'
-    if not promised and least < math.sqrt(2) * needed:
-        text += f"; and {spaced}"
+        text += f"; and {spaced}" * (least < math.sqrt(2) * needed)
     return _collision_remark(mission, at, planned.phase, text, exact=planned.exact)
 
 
@@ -116,7 +114,7 @@ def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
     """Remarks on vehicles in the downwash of another one."""
     radius, limit = mission.fleet.radius, mission.limits.separation_below
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
-    for planned in preflight.planned_phases:
+    for planned in preflight.flown_phases:
         height, pair = proximity.headroom(planned.position, radius)
         k = int(height.argmin())
         if height[k] < worst.get(planned.exact, (np.inf,))[0]:
@@ -163,7 +161,7 @@ def _measured_peaks(
 def find_planned_peaks(mission: Mission, preflight: Preflight) -> None:
     """Find what of each motion is nearest to its limit, at samples; jerk and tilt are those of tracked slots."""
     for limit in limits_of(mission, kept_if_unlimited=WORST_SHOWN):
-        q, way = limit.of, preflight.planned_phases
+        q, way = limit.of, preflight.flown_phases
         if q.order == 3 or q.name == "tilt":
             way = [planned for planned in way if planned.leg.phase.tracks_slots]
         if way:
@@ -171,7 +169,7 @@ def find_planned_peaks(mission: Mission, preflight: Preflight) -> None:
             values = [limit.values(x, np.arange(mission.n_agents)) for x in states]
             preflight.worst[q.name] = _nearest_to_limit(mission, q, way, values, limit.most)
     # Of the geofence, only what breaks it is said.
-    peaks = _measured_peaks(mission, preflight.planned_phases)
+    peaks = _measured_peaks(mission, preflight.flown_phases)
     preflight.worst |= {q.name: worst for q, worst in peaks if not q.limit}
 
 
@@ -185,7 +183,7 @@ def _planned_states_up_to_order(planned: PlannedPhase, order: int) -> Floats:
 def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on the effects of wind, gusts, noise and mass errors that follow from the planned paths."""
     d = mission.disturbances
-    if d is None or not preflight.planned_phases:
+    if d is None or not preflight.flown_phases:
         return
     believed, true, drag = mission.fleet.mass, mission.true_mass, mission.drag
     wind, up = np.array(d.wind), np.array([0.0, 0.0, 1.0])
@@ -197,12 +195,12 @@ def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
     if d.noise is not None:
         noise = 3 * believed * math.hypot(k1 * d.noise.position, k2 * d.noise.velocity)
     needs = []
-    for planned in preflight.planned_phases:
+    for planned in preflight.flown_phases:
         force = true[:, None] * (planned.acceleration + g * up)
         force -= drag[:, None] * (wind - planned.velocity)
         needs.append(np.linalg.norm(force, axis=2) + gusts + noise)
     limits, thrust = mission.fleet.thrust_limit, QUANTITIES["thrust"]
-    most = _nearest_to_limit(mission, thrust, preflight.planned_phases, needs, limits)
+    most = _nearest_to_limit(mission, thrust, preflight.flown_phases, needs, limits)
     steady = drag_and_lift(mission, np.tile(wind, (len(drag), 1)))
     steady -= ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
@@ -228,7 +226,7 @@ def step_thrust_remarks(mission: Mission, preflight: Preflight) -> Iterator[Rema
     if c.stabilisation == "none":
         return
     limits = mission.fleet.thrust_limit
-    ends = (planned.position[-1] for planned in preflight.planned_phases)
+    ends = (planned.position[-1] for planned in preflight.flown_phases)
     starts = [mission.fleet.position, *ends]
     for phase, r in zip(mission.phases, starts, strict=False):
         shaping = phase.shaping
@@ -257,7 +255,7 @@ def waypoint_miss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Re
     """Remarks on goals that the body misses even without errors of control: its regulator has too little time."""
     masses = mission.fleet.mass
     begun = True  # whether the phase begins when and where it is planned
-    for planned in preflight.planned_phases:
+    for planned in preflight.flown_phases:
         leg = planned.leg
         phase, goal, exact = leg.phase, leg.planned_end_state.goal, begun
         begun = begun and phase.settle is None
@@ -295,7 +293,7 @@ def waypoint_miss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Re
 def limit_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on speed, acceleration, geofence and what else has a limit beyond it."""
     hopeless: set[str] = set()  # limits that no time keeps; each is told once
-    for planned in preflight.planned_phases:
+    for planned in preflight.flown_phases:
         phase = planned.leg.phase
         if (mission.smooth or phase.follows_curves) and phase.tracks_slots:
             # The limit that its reference breaks most, with the least time that keeps all.

@@ -58,11 +58,10 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
             if not model.point:
                 need = _vehicle_needs_on_path(model, x[:, :, i], yaw[:, :, i], mission.gravity)
                 needs.append(_vehicle_check(model, need, time, f"agent {i + 1}", planned.phase))
-    jump = _worst_accel_and_tilt_jump(mission, tracked)
     return VehicleCheck(
         rotor_force=max((x.rotor_force for x in needs), key=lambda force: force[0] / force[3]),
         tilt=max((x.tilt for x in needs), key=lambda tilt: tilt[0]),
-        jump=jump,
+        jump=_worst_accel_and_tilt_jump(mission, tracked),
         beyond=max((x.beyond for x in needs if x.beyond), key=lambda y: y[0], default=None),
     )
 
@@ -105,7 +104,7 @@ def _worst_accel_and_tilt_jump(
     mission: Mission, way: Sequence[PlannedPhase]
 ) -> tuple[float, float, float, str] | None:
     """The greatest jump of the reference's acceleration [m/s^2], of the tilt [deg], its time [s], and the phase."""
-    worst = None
+    jumps: list[tuple[float, float, float, str]] = []
     for before, after in pairwise(way):
         if before.leg.end != after.leg.start:
             continue
@@ -117,9 +116,8 @@ def _worst_accel_and_tilt_jump(
         up = np.array([0.0, 0.0, mission.gravity])
         u, v = (f[i] + up for f in (a, b))
         angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(u, v)), u @ v))
-        if worst is None or jump[i] > worst[0]:
-            worst = float(jump[i]), float(angle), float(t[0]), after.phase
-    return worst
+        jumps.append((float(jump[i]), float(angle), float(t[0]), after.phase))
+    return max(jumps, key=lambda jump: jump[0], default=None)
 
 
 def vehicle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
@@ -128,7 +126,7 @@ def vehicle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         return
     preflight.worst["rotor_force"] = preflight.vehicles.rotor_force[:4]
     preflight.worst["tilt"] = *preflight.vehicles.tilt[:3], mission.limits.tilt_deg
-    exact = {planned.phase for planned in preflight.planned_phases if planned.exact}
+    exact = {planned.phase for planned in preflight.flown_phases if planned.exact}
     if preflight.vehicles.beyond is not None:
         share, who, phase, need = preflight.vehicles.beyond
         fails = share > mission.limits.saturation and phase in exact
@@ -144,12 +142,12 @@ def vehicle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
             f" where '{jump[3]}' begins; no vehicle follows a jump. Use smoothness = 'jerk'"
         )
         yield Remark("note", "jumps", text)
-    yield from _jet_remarks(mission, preflight.planned_phases)
+    yield from _jet_remarks(mission, preflight.flown_phases)
 
 
 def _jet_remarks(mission: Mission, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
     """Remark on the vehicle that another one's jet pushes down the most, as a share of its weight."""
-    worst = (0.0, 0.0, 0.0, 0, 0, 0.0, 0.0, "")
+    worst, text = 0.0, ""
     for planned in way if mission.n_agents <= STACKED else ():
         flow = pair_jet_speeds(mission, planned.position)
         down = np.zeros((*flow.shape, 3))
@@ -157,16 +155,13 @@ def _jet_remarks(mission: Mission, way: Sequence[PlannedPhase]) -> Iterator[Rema
         push = drag_and_lift(mission, down.swapaxes(1, 2)).swapaxes(1, 2)[..., 2]
         share = push / (mission.fleet.mass * mission.gravity)[:, None]
         k, i, j = np.unravel_index(int(share.argmax()), share.shape)
-        if share[k, i, j] > worst[0]:
-            r, t = planned.position[k], float(planned.time[k])
-            there = (push[k, i, j], flow[k, i, j], i, j, r[j, 2] - r[i, 2], t, planned.phase)
-            worst = share[k, i, j], *there
-    if worst[0] < _BLOW:
-        return
-    _, push, flow, i, j, s, t, phase = worst
-    rest = "" if mission.all_disturbances.downwash else "; set disturbances.downwash to fly with it"
-    text = (
-        f"agent {i + 1} is {s:.2f} m below agent {j + 1} at {t:.2f} s in '{phase}': its jet of {flow:.1f} m/s pushes"
-        f" with {push:.2g} N, {100 * worst[0]:.0f} % of the weight{rest}"
-    )
-    yield Remark("note", "downwash", text)
+        if share[k, i, j] > worst:
+            r, worst = planned.position[k], share[k, i, j]
+            text = (
+                f"agent {i + 1} is {r[j, 2] - r[i, 2]:.2f} m below agent {j + 1} at {planned.time[k]:.2f} s in"
+                f" '{planned.phase}': its jet of {flow[k, i, j]:.1f} m/s pushes with {push[k, i, j]:.2g} N,"
+                f" {100 * worst:.0f} % of the weight"
+            )
+    if worst >= _BLOW:
+        rest = "; set disturbances.downwash to fly with it"
+        yield Remark("note", "downwash", text + rest * (not mission.all_disturbances.downwash))
