@@ -16,9 +16,7 @@ import rigidfleet as rf
 from rigidfleet.cli.app import main
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.abort import Aborts, _altitude_levels
-from rigidfleet.planning.legs import state_at_start
-from rigidfleet.planning.losses import legs_from
-from rigidfleet.planning.timing import complete_times
+from rigidfleet.planning.timing import complete_times, legs_up_to
 from rigidfleet.preflight.aborts import check_aborts
 from rigidfleet.simulation.together import simulate_together
 
@@ -31,7 +29,7 @@ def show(**abort: Any) -> Mission:
 
 def aborts_of(mission: Mission) -> Aborts:
     """Its aborts."""
-    return Aborts(mission, legs_from(mission, state_at_start(mission), mission.phases))
+    return Aborts(mission, legs_up_to(mission, len(mission.phases)))
 
 
 def random_mission(seed: int, *, rotors: bool = False) -> tuple[Mission, int]:
@@ -92,7 +90,7 @@ def flown_apart(seed: int, *, rotors: bool = False) -> float:
     assert at is not None
     gone = mission.lost_at <= begins
     complete = complete_times(mission)
-    legs = legs_from(complete, state_at_start(complete), complete.phases)
+    legs = legs_up_to(complete, len(complete.phases))
     abort = Aborts(complete, legs, gone if gone.any() else None).abort_at(at)
     left = [i for i in range(mission.n_agents) if i != lost]
     i, j = np.array(list(itertools.combinations(left, 2))).T

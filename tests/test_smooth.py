@@ -482,7 +482,7 @@ def test_automatic_times_keep_the_limits_and_no_shorter_ones_do():
             if phase.kind == "turn"
             else "duration"
         )
-        now = preview_phases(resolved, k)[0][-1].leg.planned_end_state
+        now = preview_phases(resolved)[0][k - 1].leg.planned_end_state
         fast = {key: 0.95 * getattr(phase, key)}
         if phase.kind == "fly" and phase.through:
             fast["through"] = tuple(
