@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.formation.assignment import closest_approach
-from rigidfleet.math.piecewise import CUBIC, Piecewise
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.planning.certificate import Certificate, prove_ways
 from rigidfleet.typing import Floats
 
@@ -140,15 +140,6 @@ class _Limits(NamedTuple):
     metric: Floats
 
 
-def _b_spline_weights(u: Floats, spans: int) -> Floats:
-    """Weights (K, M + 3) of the control points at parameters u (K,) in [0, M]."""
-    k = np.minimum(u.astype(np.int64), spans - 1)
-    x = u - k
-    B = np.zeros((len(u), spans + 3))
-    B[np.arange(len(u))[:, None], k[:, None] + np.arange(4)] = x[:, None] ** np.arange(4) @ CUBIC.T
-    return B
-
-
 def _half_ellipse_control_points(start: Floats, goal: Floats) -> Floats:
     """Control points (M + 3, N, 3) of ways that all keep to the right, seen from above on half an ellipse.
 
@@ -167,7 +158,8 @@ def _descend(control: Floats, duration: float, limits: _Limits, rng: np.random.G
     control = control.copy()
     longest = float(np.linalg.norm(control[-1] - control[0], axis=1).max())
     each = max(_SAMPLES, math.ceil(_PASSED * longest / (_SPANS * limits.distance)))
-    B = _b_spline_weights(np.linspace(0.0, _SPANS, _SPANS * each + 1), _SPANS)
+    # Weights of the control points: each one's own spline.
+    B = Piecewise.b_spline(np.eye(_SPANS + 3), 1.0).at(np.linspace(0.0, 1.0, _SPANS * each + 1))
     free = slice(3, _SPANS)
     share = np.linspace(0.0, 1.0, _SPANS - 1)[1:-1, None, None]
     noise = rng.uniform(-1, 1, (1, n, 3)) * (_NOISE * limits.distance / limits.metric)
