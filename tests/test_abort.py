@@ -205,6 +205,25 @@ def test_vehicles_that_drag_holds_back_get_a_wider_grid_to_land_on(apart: float)
     assert verdict.by_name["separation"].passed, verdict.summary
 
 
+def test_drag_that_grows_with_the_square_of_the_speed_holds_vehicles_back_too() -> None:
+    """On ways of different lengths, vehicles without rotor drag are off theirs by the drag of their bodies."""
+    start = np.array([[0.0, 0, 15], [6, 0, 15], [0, 6, 15]])
+    q = {"model": "paper", "rotor_drag": 0.0, "rotor_inflow": 0.0, "body_drag": [0.05] * 3}
+    mission = Mission.from_dict(
+        {
+            "schema_version": 1, "name": "bodies", "smoothness": "jerk", "vehicles": {"q": q},
+            "agents": {"vehicle": "q", "position": start.tolist(), "radius": 0.25},
+            "obstacles": [{"kind": "ground", "name": "ground"}], "formations": {"f": {"slots": start.tolist()}},
+            "phases": [{"kind": "establish", "formation": "f", "duration": 4}, {"kind": "hold", "duration": 9}],
+        }
+    )  # fmt: skip
+    assert not mission.drag.any()
+    aborts = aborts_of(mission)
+    over, down = aborts.abort_at(8.0).home.steps
+    assert down.off == pytest.approx(aborts.off, abs=1e-12)  # as far down for all
+    assert over.off > aborts.off + 0.01
+
+
 @pytest.mark.parametrize("to", ["any", "own"])
 def test_every_second_has_a_way_home_and_no_two_come_nearer(to: str) -> None:
     """Samples of every second's abort come as near as proved, to a millimetre, and no nearer; all stand on places."""

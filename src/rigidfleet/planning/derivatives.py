@@ -77,10 +77,9 @@ def slot_taylor(reference: Reference, body: tuple[Floats, Floats], time: Floats)
     """Taylor series (5, 3, N, K) of each slot, from the `body_taylor` at times (K,) [s]; see `slot_derivatives`."""
     cm, axes = body
     if len(reference.knots):
-        return (
-            series.product(slot_way_taylor(reference, time)[: len(cm)], axes, _in_world)
-            + cm[:, :, None]
-        )
+        ways = slot_way_taylor(reference, time)[: len(cm)]
+        slots = series.product(ways, axes.swapaxes(1, 2), _matrix_product).swapaxes(1, 2)
+        return slots + cm[:, :, None]
     s = blend_taylor(time, reference.t0, reference.T_b)[: len(cm)]
     if reference.turn.any():
         turned = series.rotation_series(s[..., None] * reference.turn).transpose(0, 2, 3, 1)
@@ -100,13 +99,8 @@ def slot_way_taylor(reference: Reference, time: Floats) -> Floats:
     return values
 
 
-def _in_world(a: Floats, axes: Floats) -> Floats:
-    """Vectors (..., 3, N, K) in world axes, from (..., N, 3, K) in body axes and ``axes`` (..., 3, 3, K)."""
-    return (axes[..., :, None, :, :] * a[..., None, :, :, :]).sum(axis=-2)
-
-
 def _matrix_product(a: Floats, b: Floats) -> Floats:
-    """Products (..., 3, 3, K) of matrices (..., 3, 3, K)."""
+    """Products (..., N, 3, K) of matrices (..., N, 3, K) and (..., 3, 3, K)."""
     return (a[..., :, :, None, :] * b[..., None, :, :, :]).sum(axis=-3)
 
 

@@ -60,13 +60,10 @@ def least_duration(
     start: ArrayLike, goal: ArrayLike, speed: ArrayLike, acceleration: ArrayLike
 ) -> float:
     """Least time [s] in which the slowest vehicle alone goes from rest to rest, with limits on each axis."""
-    s, g = (np.asarray(x, dtype=np.float64) for x in (start, goal))
-    way = np.abs(g - s)
-    v, a = np.broadcast_to(speed, 3), np.broadcast_to(acceleration, 3)
-    slow = 2.0 * np.sqrt(way / a)
-    with np.errstate(invalid="ignore"):
-        fast = np.where(way > v**2 / a, way / v + v / a, slow)
-    return float(np.maximum(fast, 0.0).max())
+    way = np.abs(np.subtract(goal, start))
+    v, a = np.asarray(speed), np.asarray(acceleration)
+    fast = way / v + v / a
+    return float(np.where(way > v**2 / a, fast, 2.0 * np.sqrt(way / a)).max())
 
 
 def plan_transfer(
