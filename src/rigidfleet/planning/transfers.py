@@ -1,10 +1,10 @@
 """Transfers of labelled vehicles through a crowd: bent ways found together, and proved.
 
 Where vehicles are dense, neither straight ways nor layers fit. Here all ways are uniform cubic B-splines of one
-duration, from rest to rest. Their control points minimise penalties of what is broken: the distance of pairs at
-samples, the box, speed and acceleration; then the ways are proved. Speed and acceleration of a B-spline are bounded by
-differences of its control points, so that limits per axis and the box hold between samples, too. The distance of pairs
-is bounded in continuous time by conservative advancement on the ways themselves
+duration, from rest to rest. Their control points lie in the box and minimise penalties of what is broken: the distance
+of pairs at samples, speed and acceleration; then the ways are proved. Speed and acceleration of a B-spline are bounded
+by differences of its control points, so that limits per axis and the box hold between samples, too. The distance of
+pairs is bounded in continuous time by conservative advancement on the ways themselves
 (`rigidfleet.planning.certificate.prove_ways`).
 
 The penalty methods are those of trajectory optimisation with B-splines, e.g. Zhou et al., Robust and efficient
@@ -31,8 +31,8 @@ _SPANS, _SAMPLES, _PASSED = 16, 3, 2.0
 _SHARE = np.clip((np.arange(_SPANS + 3) - 2) / (_SPANS - 2), 0.0, 1.0)[:, None, None]
 #: Durations tried, as multiples of the slowest single vehicle's, and random starts of each, before one roundabout.
 _SLOWER, _STARTS = (1.5, 1.8, 2.1, 2.4), 2
-#: Weights of distances, speed, acceleration and box; of smoothness. Distances are wanted this much larger.
-_WEIGHTS, _SMOOTH, _SPARE = (20.0, 2.0, 2.0, 20.0), 1e-3, 1.04
+#: Weights of distances, and of speed and acceleration; of smoothness. Distances are wanted this much larger.
+_WEIGHTS, _SMOOTH, _SPARE = (20.0, 2.0), 1e-3, 1.04
 #: Greatest random displacement of a control point at the start, as a multiple of the distance to keep.
 _NOISE = 1.0
 #: Duration [s] where nobody has to move.
@@ -149,7 +149,7 @@ def _half_ellipse_control_points(start: Floats, goal: Floats) -> Floats:
 
 def _descend(control: Floats, duration: float, limits: _Limits, rng: np.random.Generator) -> Floats:
     """Control points (M + 3, N, 3) with little penalty, from those of other ways; their ends stay."""
-    from scipy.optimize import minimize
+    from scipy.optimize import Bounds, minimize
 
     n, h = control.shape[1], duration / _SPANS
     control = control.copy()
@@ -163,7 +163,7 @@ def _descend(control: Floats, duration: float, limits: _Limits, rng: np.random.G
     control[free] += 4.0 * share * (1 - share) * noise
     shape = control[free].shape
     near = (_SPARE * limits.distance) ** 2
-    w_near, w_speed, w_acceleration, w_box = _WEIGHTS
+    w_near, w_fast = _WEIGHTS
     itself = np.arange(n)
 
     def penalty(y: Floats) -> tuple[float, Floats]:
@@ -178,38 +178,27 @@ def _descend(control: Floats, duration: float, limits: _Limits, rng: np.random.G
         cost = 0.5 * w_near / near**2 * float((miss * miss).sum())
         push = x * miss.sum(axis=2)[:, :, None] - miss @ x
         slope -= np.tensordot(B.T, (4.0 * w_near / near**2) * push * limits.metric, axes=1)
-        for order, most, weight in (
-            (1, limits.speed * h, w_speed),
-            (2, limits.acceleration * h * h, w_acceleration),
+        for order, most, smooth in (
+            (1, limits.speed * h, 0.0),
+            (2, limits.acceleration * h * h, _SMOOTH),
         ):
             d = np.diff(control, order, axis=0) / most
             over = np.sign(d) * np.maximum(np.abs(d) - 0.99, 0.0)
-            cost += weight * float((over * over).sum())
-            rise = 2.0 * weight * over / most
-            slope -= _negative_difference_adjoint(rise, order)
-            if order == 2:
-                cost += _SMOOTH * float((d * d).sum())
-                slope -= _negative_difference_adjoint(2.0 * _SMOOTH * d / most, order)
-        out = np.maximum(control - limits.high, 0.0) + np.minimum(control - limits.low, 0.0)
-        cost += w_box * float((out * out).sum())
-        slope += 2.0 * w_box * out
+            cost += float((w_fast * over * over + smooth * d * d).sum())
+            rise = 2.0 * (w_fast * over + smooth * d) / most
+            # The transpose of differences are those of what ends in zeros, of odd order with the other sign.
+            ends = (order, order), (0, 0), (0, 0)
+            slope += (-1.0) ** order * np.diff(np.pad(rise, ends), order, axis=0)
         return cost, slope[free].ravel()
 
-    bounds = [
-        (a, b) for _ in range(shape[0] * n) for a, b in zip(limits.low, limits.high, strict=True)
-    ]
+    # No place within the bounds is out of the box.
+    bounds = Bounds(*(np.tile(corner, shape[0] * n) for corner in (limits.low, limits.high)))
     optimum = minimize(
         penalty, control[free].ravel(), jac=True, method="L-BFGS-B", bounds=bounds,
         options={"maxiter": _ITERATIONS, "maxcor": 20},
     )  # fmt: skip
     control[free] = optimum.x.reshape(shape)
     return control
-
-
-def _negative_difference_adjoint(rise: Floats, order: int) -> Floats:
-    """The negative transpose of differences of an order, applied to slopes of them."""
-    turned = np.diff(np.pad(rise, ((order, order), (0, 0), (0, 0))), order, axis=0)
-    return turned if order == 1 else -turned
 
 
 def _keeps_limits(control: Floats, duration: float, limits: _Limits) -> bool:
