@@ -21,10 +21,8 @@ from rigidfleet.math.constraint_jacobian import filter_factors
 from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.abort import Aborts
-from rigidfleet.planning.legs import state_at_start
-from rigidfleet.planning.losses import legs_from
 from rigidfleet.planning.preview import preview_phases
-from rigidfleet.planning.timing import complete_times
+from rigidfleet.planning.timing import complete_times, legs_up_to
 from rigidfleet.plotting.style import DASHES, FAINT, FLOWN, GREY, INK, PALETTE, TONES
 
 BLUE, ORANGE, GREEN, RED = PALETTE[:4]
@@ -481,7 +479,7 @@ def way_home() -> Figure:
     for ax, to in zip(fig.subplots(1, 2, sharey=True), ("any", "own"), strict=True):
         data = load_mission("change-of-picture").to_dict() | {"abort": {"to": to}}
         mission = complete_times(Mission.from_dict(data))
-        aborts = Aborts(mission, legs_from(mission, state_at_start(mission), mission.phases))
+        aborts = Aborts(mission, legs_up_to(mission, len(mission.phases)))
         abort = aborts.abort_at(19.0)
         before = aborts.plan.at(np.linspace(16.0, abort.begins, 20))
         t = abort.begins

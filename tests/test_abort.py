@@ -16,9 +16,7 @@ import rigidfleet as rf
 from rigidfleet.cli.app import main
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.abort import Aborts, _altitude_levels
-from rigidfleet.planning.legs import state_at_start
-from rigidfleet.planning.losses import legs_from
-from rigidfleet.planning.timing import complete_times
+from rigidfleet.planning.timing import complete_times, legs_up_to
 from rigidfleet.preflight.aborts import check_aborts
 from rigidfleet.simulation.together import simulate_together
 
@@ -31,7 +29,7 @@ def show(**abort: Any) -> Mission:
 
 def aborts_of(mission: Mission) -> Aborts:
     """Its aborts."""
-    return Aborts(mission, legs_from(mission, state_at_start(mission), mission.phases))
+    return Aborts(mission, legs_up_to(mission, len(mission.phases)))
 
 
 def random_mission(seed: int, *, rotors: bool = False) -> tuple[Mission, int]:
@@ -92,7 +90,7 @@ def flown_apart(seed: int, *, rotors: bool = False) -> float:
     assert at is not None
     gone = mission.lost_at <= begins
     complete = complete_times(mission)
-    legs = legs_from(complete, state_at_start(complete), complete.phases)
+    legs = legs_up_to(complete, len(complete.phases))
     abort = Aborts(complete, legs, gone if gone.any() else None).abort_at(at)
     left = [i for i in range(mission.n_agents) if i != lost]
     i, j = np.array(list(itertools.combinations(left, 2))).T
@@ -205,6 +203,25 @@ def test_vehicles_that_drag_holds_back_get_a_wider_grid_to_land_on(apart: float)
     verdict = rf.assess(rf.simulate(Mission.from_dict(mission.to_dict() | {"abort": {"at": 10.0}})))
     assert verdict.by_name["way_home"].passed, verdict.summary
     assert verdict.by_name["separation"].passed, verdict.summary
+
+
+def test_drag_that_grows_with_the_square_of_the_speed_holds_vehicles_back_too() -> None:
+    """On ways of different lengths, vehicles without rotor drag are off theirs by the drag of their bodies."""
+    start = np.array([[0.0, 0, 15], [6, 0, 15], [0, 6, 15]])
+    q = {"model": "paper", "rotor_drag": 0.0, "rotor_inflow": 0.0, "body_drag": [0.05] * 3}
+    mission = Mission.from_dict(
+        {
+            "schema_version": 1, "name": "bodies", "smoothness": "jerk", "vehicles": {"q": q},
+            "agents": {"vehicle": "q", "position": start.tolist(), "radius": 0.25},
+            "obstacles": [{"kind": "ground", "name": "ground"}], "formations": {"f": {"slots": start.tolist()}},
+            "phases": [{"kind": "establish", "formation": "f", "duration": 4}, {"kind": "hold", "duration": 9}],
+        }
+    )  # fmt: skip
+    assert not mission.drag.any()
+    aborts = aborts_of(mission)
+    over, down = aborts.abort_at(8.0).home.steps
+    assert down.off == pytest.approx(aborts.off, abs=1e-12)  # as far down for all
+    assert over.off > aborts.off + 0.01
 
 
 @pytest.mark.parametrize("to", ["any", "own"])

@@ -20,7 +20,7 @@ from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg, leg_of
 from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.reference import copy_with
-from rigidfleet.planning.timing import complete_times
+from rigidfleet.planning.timing import complete_times, legs_up_to
 from rigidfleet.preflight.losses import planned_answer_to_loss
 from rigidfleet.result import Result
 
@@ -42,7 +42,13 @@ def planned_legs(mission: Mission, result: Result) -> list[Leg]:
     sure = True
     for k, record in enumerate(result.phases):
         if record.t_start >= first:
-            return [*found[:k], *planned_answer_to_loss(mission, found[k - 1], found).legs]
+            # One that settles ends before its planned end, at which another leg is under way.
+            begun = [
+                copy_with(leg, end=flown.t_end)
+                for leg, flown in zip(found[: k - 1], result.phases, strict=False)
+            ]
+            plan = legs_up_to(mission, len(mission.phases), [*begun, found[k - 1]])
+            return [*found[:k], *planned_answer_to_loss(mission, found[k - 1], plan).legs]
         if not sure:
             at = int(np.searchsorted(result.time, record.t_start))
             before = found[k - 1].state_at(record.t_start)
@@ -285,6 +291,19 @@ def test_a_drawn_mission_follows_the_legs_that_its_check_plans(seed):
     assert compare(Draw(seed).mission())
 
 
+def test_a_loss_after_a_phase_that_settles_early_follows_the_legs_planned_from_there():
+    """A formation that has settled before its planned end slows down from where it is when an agent is lost."""
+    draw = Draw(0)
+    draw.smooth, draw.phases = True, [
+        {"kind": "establish", "formation": "frame", "blend": 6.0, "settle": {"tolerance": 0.01}},
+        {"kind": "fly", "position": [6, 1, 9], "duration": 10.0},
+    ]  # fmt: skip
+    lost = {"lost": [{"agent": 3, "time": 9.0}], "on_loss": "hold"}
+    mission = Mission.from_dict(draw.mission(lossless=True).to_dict() | {"disturbances": lost})
+    assert preview_phases(mission)[0][0].leg.end > 9.0
+    assert compare(mission)["follow"] == 1  # along the plan, as the ground is in the way of a brake
+
+
 @pytest.mark.long
 def test_two_hundred_drawn_missions_follow_the_legs_that_their_checks_plan():
     """So it is in 200 drawn missions, which have phases of all kinds, automatic times, transitions and losses."""
@@ -431,6 +450,8 @@ ONCE: list[dict[str, Any]] = [
 def test_a_phase_departs_once(monkeypatch):
     """A preview, a flight and a search of automatic times each attach the frame and align the slots once a phase.
 
+    So does a check, which judges the legs that the times follow from; it compares two other assignments beside.
+
     Up to the last automatic time there are four phases, of which two change the shape. Before legs were made once, the
     search attached the frame 20 times for them, and aligned slots 6 times; a preview and a flight did so once a phase,
     each by code of its own.
@@ -438,17 +459,48 @@ def test_a_phase_departs_once(monkeypatch):
     draw = Draw(0)
     draw.smooth, draw.phases = True, ONCE
     written = draw.mission(lossless=True)
-    once = {"depart": 6, "_attach_frame": 6, "shift_and_rotvec": 3}
+    once = Counter({"depart": 6, "_attach_frame": 6, "shift_and_rotvec": 3})
     count = calls(monkeypatch)
     mission = complete_times(written)
-    assert count == once | {
-        "depart": 4,
-        "_attach_frame": 4,
-        "shift_and_rotvec": 2,
-    }  # up to the last automatic time
+    # Up to the last automatic time.
+    assert count == {"depart": 4, "_attach_frame": 4, "shift_and_rotvec": 2}
     count.clear()
     preview_phases(mission)
     assert count == once
     count.clear()
     rf.simulate(mission)
     assert count == once
+    count.clear()
+    rf.check(written)
+    compared = {"depart": 2, "_attach_frame": 2, "shift_and_rotvec": 2}  # other assignments
+    assert count == once + Counter(compared)
+
+
+@pytest.mark.parametrize("name", ["hill-search", "narrow-passage-found", "change-of-picture"])
+def test_a_check_departs_once_a_phase_with_transitions_and_ways(monkeypatch, capsys, name):
+    """The legs that transitions, ways and times are planned by are those that the command judges.
+
+    Each of the two other assignments that a check compares takes the first formation once more.
+    """
+    mission = complete_times(rf.load_mission(name))
+    others = {"shortest", "safe"} - {mission.assignment}
+    count = calls(monkeypatch)
+    main(["check", name, "--json"])
+    assert count["depart"] == len(mission.phases) + len(others)
+
+
+def test_ways_of_agents_depart_once_a_phase(monkeypatch):
+    """Bent ways, and those to the own places, which ask for the state before them, take it from the legs so far."""
+    draw = Draw(0)
+    draw.smooth, draw.phases = True, [
+        {"kind": "takeoff", "height": 6.0, "duration": "auto"},
+        {"kind": "establish", "formation": "frame", "duration": "auto", "blend": "auto"},
+        {"kind": "reshape", "formation": "wide", "transition": "ways", "duration": "auto"},
+        {"kind": "land", "places": "own", "duration": "auto"},
+    ]  # fmt: skip
+    data = draw.mission(lossless=True).to_dict()
+    data["agents"]["position"] = (STANDING - [0.0, 0.0, 0.75]).tolist()
+    count = calls(monkeypatch)
+    mission = rf.check(Mission.from_dict(data)).mission
+    assert len(mission.phases) > 4
+    assert count["depart"] == len(mission.phases) + 2

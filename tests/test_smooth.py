@@ -18,6 +18,7 @@ from rigidfleet.kernel.problem import SHAPE, Motion, Reference, workspace
 from rigidfleet.math import series, splines
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.mission.draft import draft
+from rigidfleet.mission.schema import VehicleYaw
 from rigidfleet.planning import derivatives as d
 from rigidfleet.planning.legs import Leg, leg_of
 from rigidfleet.planning.limits import limits_of, use_of_limits
@@ -137,7 +138,7 @@ def test_rotation_vectors_invert_rotations():
 def test_yaw_and_its_rates_belong_together(kind):
     """Rate and acceleration of the yaw are differences of the yaw."""
     reference, motion = a_reference()
-    yaw = d.Yaw(kind, point=(20.0, -5.0, 3.0))
+    yaw = VehicleYaw(kind=kind, point=(20.0, -5.0, 3.0))
     h, t = 0.01, 1.9
     grid = t + h * np.arange(-4, 5)
     time = np.concatenate([[1.6], grid])
@@ -151,7 +152,7 @@ def test_yaw_with_the_formation_is_its_euler_angle_when_it_does_not_roll():
     reference, _ = a_reference()
     attitude = Rotation.from_euler("ZYX", [130.0, 50.0, 0.0], degrees=True).as_matrix()
     still = Motion(np.array([0.0, 1.0]), np.zeros((1, 6, 6)), attitude.T)
-    found = d.yaw_derivatives(reference, still, np.array([0.5]), d.Yaw())
+    found = d.yaw_derivatives(reference, still, np.array([0.5]), VehicleYaw())
     np.testing.assert_allclose(np.rad2deg(found[0, 0]), 130.0, atol=1e-12)
     np.testing.assert_allclose(found[0, 1:], 0.0, atol=1e-12)
 
@@ -173,7 +174,7 @@ def test_yaw_along_turns_into_the_way_keeps_still_at_rest_and_turns_back():
     still = reference._replace(dp=np.zeros((4, 3)), turn=np.zeros(3))
     motion = straight((30.0, 10.0), (0.0, 5.0), (-30.0, 10.0))
     time = np.linspace(0.0, 25.0, 251)
-    found = d.yaw_derivatives(still, motion, time, d.Yaw("along"), np.full(4, 1.5))
+    found = d.yaw_derivatives(still, motion, time, VehicleYaw(kind="along"), np.full(4, 1.5))
     yaw = np.rad2deg(found[:, 0])
     np.testing.assert_allclose(yaw[90:151], 0.0, atol=0.1)
     np.testing.assert_allclose(yaw[150], yaw[101], atol=1e-9)
@@ -482,7 +483,7 @@ def test_automatic_times_keep_the_limits_and_no_shorter_ones_do():
             if phase.kind == "turn"
             else "duration"
         )
-        now = preview_phases(resolved, k)[0][-1].leg.planned_end_state
+        now = preview_phases(resolved)[0][k - 1].leg.planned_end_state
         fast = {key: 0.95 * getattr(phase, key)}
         if phase.kind == "fly" and phase.through:
             fast["through"] = tuple(

@@ -328,13 +328,13 @@ def test_a_way_is_searched_once_where_nothing_that_varies_matters_to_it(
     from rigidfleet.planning import ways
     from rigidfleet.simulation.together import simulate_together
 
-    count, search = [0], ways._Search.mission_with_way
+    count, search = [0], ways._Search.mission_with_way_and_legs
 
-    def counted(self: Any) -> Mission:
+    def counted(self: Any) -> Any:
         count[0] += 1
         return search(self)
 
-    monkeypatch.setattr(ways._Search, "mission_with_way", counted)
+    monkeypatch.setattr(ways._Search, "mission_with_way_and_legs", counted)
     varied = Sweep.of(FOUND, [line])
     rows = fly_runs(varied, range(2))
     assert count[0] == searches

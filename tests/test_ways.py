@@ -412,7 +412,7 @@ def test_a_search_says_what_it_looks_for(monkeypatch):
 def test_a_way_whose_proof_lacks_room_is_looked_for_again_with_more(monkeypatch):
     """If the proof lacks 0.9 m, the way that is found next has it, at samples of its straight parts."""
     tried: list[tuple[float, float]] = []
-    try_way = ways._Search._mission_and_shortfall
+    try_way = ways._Search._mission_legs_and_shortfall
 
     def lacking_at_first(search, roadmap, way):
         room, stops = np.inf, list(zip(way.places, way.layers, strict=True))
@@ -422,10 +422,10 @@ def test_a_way_whose_proof_lacks_room_is_looked_for_again_with_more(monkeypatch)
                 places = straight[:, None] + roadmap.layers[i].offsets
                 room = min(room, roadmap.space.clearance(places, roadmap.radius).min())
         tried.append((roadmap.need, room))
-        mission, lacking = try_way(search, roadmap, way)
-        return mission, 0.9 if len(tried) == 1 else lacking
+        mission, legs, lacking = try_way(search, roadmap, way)
+        return mission, legs, 0.9 if len(tried) == 1 else lacking
 
-    monkeypatch.setattr(ways._Search, "_mission_and_shortfall", lacking_at_first)
+    monkeypatch.setattr(ways._Search, "_mission_legs_and_shortfall", lacking_at_first)
     complete_times(load_mission("narrow-passage-found"))
     (need, room), (more, roomier) = tried
     assert more == pytest.approx(need + 0.902)

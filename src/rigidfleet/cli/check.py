@@ -59,7 +59,7 @@ def check(
     from rigidfleet._common.progress import report_steps_to
     from rigidfleet._common.toml import to_toml
     from rigidfleet.mission import load_mission
-    from rigidfleet.planning.timing import complete_times, expand_mission
+    from rigidfleet.planning.timing import expand_mission
 
     expand = expand and with_toml_suffix(expand)
     refuse_overwriting(expand, force=force, other="give another path")
@@ -73,7 +73,14 @@ def check(
             if expand is not None:
                 loaded = expand_mission(loaded)
                 write_file(expand, (loaded.file_digests_text + to_toml(loaded.to_dict())).encode())
-            loaded = complete_times(loaded)
+            if abort:
+                from rigidfleet.preflight.aborts import check_aborts
+
+                home = check_aborts(loaded, progress=watch.update)
+            else:
+                from rigidfleet.preflight.check import check as preflight
+
+                ahead = preflight(loaded, search=realisations, progress=watch.update)
     except MissionError as error:
         if not json:
             raise
@@ -84,10 +91,6 @@ def check(
         console.print_json({"mission": mission, "right": False, "findings": findings})
         return BAD_INPUT
     if abort:
-        from rigidfleet.preflight.aborts import check_aborts
-
-        with watch:
-            home = check_aborts(loaded, progress=watch.update)
         if out is not None:
             home.write(out)
         if json:
@@ -97,17 +100,15 @@ def check(
             if out is not None:
                 console.out().print(f"\nAborts   {out}", soft_wrap=True)
         return PASSED
-    from rigidfleet.preflight.check import check as preflight
-
-    with watch:
-        ahead = preflight(loaded, search=realisations, progress=watch.update)
     if figure is not None:
         from rigidfleet.plotting.graph import draw_graphs
 
         judged = {f.name: f.rigidity for f in ahead.formations}
-        draw_graphs(loaded, judged, figure)
+        draw_graphs(ahead.mission, judged, figure)
     if json:
-        console.print_json({"mission": mission, "right": True} | plain_facts(loaded) | ahead.data())
+        console.print_json(
+            {"mission": mission, "right": True} | plain_facts(ahead.mission) | ahead.data()
+        )
         return PASSED if ahead.passed else FAILED
     console.out().print(ahead.facts())
     if expand is not None:

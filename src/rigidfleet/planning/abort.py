@@ -215,6 +215,9 @@ class Aborts:
         self.mission, self.legs = mission, legs
         self.options, limits = mission.aborting, mission.limits
         self.to = to or self.options.to
+        #: When the plan ends [s], and whether on the ground.
+        self.plan_end = legs[-1].end if legs else 0.0
+        self.mission_lands = bool(legs) and legs[-1].phase.lands
         self.lost = np.zeros(mission.n_agents, dtype=np.bool_) if lost is None else lost
         self.left, self.radius = np.flatnonzero(~self.lost), mission.fleet.radius
         self.limits = limits_of(mission)
@@ -234,6 +237,11 @@ class Aborts:
             self.off = 2.0 * most
         self.apart = widest + self.need + max(allowed, self.off)
         self.below = max(self.apart, widest + (limits.separation_below or 0.0))
+        #: How vehicles fall, and how far from its fall by the plan each one (N,) may be that is lost [m].
+        self.fall_model = air = Boundaries(mission)
+        self.fall_uncertainty = (
+            self.off + _ASTRAY + _BLOWN * air.k * float(np.linalg.norm(air.wind))
+        )
         falls_down = mission.gravity >= 1.0
         self.wrecked = np.flatnonzero(self.lost & falls_down)
         self.moves = any(x.solid.moves for x in mission.solids) or self.wrecked.size > 0
@@ -244,16 +252,6 @@ class Aborts:
         self._known: dict[bytes, Home] = {}
 
     # -- the plan -----------------------------------------------------------------------------------------
-
-    @property
-    def plan_end(self) -> float:
-        """When the plan ends [s]."""
-        return self.legs[-1].end
-
-    @property
-    def mission_lands(self) -> bool:
-        """Whether the plan ends on the ground."""
-        return bool(self.legs[-1].phase.lands)
 
     def leg_number_at(self, time: float) -> int:
         """Number of the leg at a time [s]; at a switch, of the one before."""
@@ -277,17 +275,6 @@ class Aborts:
         on = np.zeros_like(pieces[-1][:1])
         on[0, ..., :2] = np.moveaxis(Piecewise(time, pieces[-1]).states(time[-1:], 2)[:, 0], 0, -1)
         return Piecewise(np.concatenate([*times, time[-1:] + 1.0]), np.concatenate([*pieces, on]))
-
-    @cached_property
-    def fall_model(self) -> Boundaries:
-        """How vehicles fall, and where to."""
-        return Boundaries(self.mission)
-
-    @cached_property
-    def fall_uncertainty(self) -> Floats:
-        """How far from its fall by the plan each vehicle (N,) may be that is lost [m]."""
-        air = self.fall_model
-        return self.off + _ASTRAY + _BLOWN * air.k * float(np.linalg.norm(air.wind))
 
     @cached_property
     def wrecks(self) -> list[Sphere]:
@@ -399,8 +386,6 @@ class Aborts:
         Drag in proportion to the speed holds vehicles off their ways that fly differently, as tracking answers to it.
         """
         mission, who = self.mission, self.left
-        if not mission.drag.any() or len(who) < 2:
-            return self.off
         v = way.states(np.linspace(0.0, way.time[-1], _LOOKS), 2)[1][:, who]
         push = drag_and_lift(mission, np.array(mission.all_disturbances.wind) - v, who)
         if mission.tracking.drag_feedforward:

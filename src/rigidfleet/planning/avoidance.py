@@ -23,10 +23,7 @@ def avoidance_in_flight(
     settings, models = mission.avoidance, mission.vehicle_models
     if settings is None or models is None:
         return None
-    mass = mission.fleet.mass
-    separation = settings.separation
-    if separation is None:
-        separation = mission.limits.separation or 0.0
+    mass, own = mission.fleet.mass, settings.separation
     limit = np.array([model.thrust_limit for model in models])
     solids = join_solids([thing.solid for thing in mission.obstacles])
     reach = np.inf if settings.sensing_range is None else settings.sensing_range
@@ -42,7 +39,7 @@ def avoidance_in_flight(
         seen=avoidance.initial_sight(
             solids, reach, settings.sensing_noise, settings.obstacle_acceleration, settings.seed
         ),
-        separation=separation,
+        separation=(mission.limits.separation or 0.0) if own is None else own,
         clearance=settings.clearance,
         drag=drag,
         lag=reaction_times(models, mission.all_disturbances),

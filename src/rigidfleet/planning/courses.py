@@ -237,14 +237,12 @@ def way_conflict_text(phase: Any, now: PhaseState) -> str:
 
 def _trajectory_conflict_text(phase: Follow, now: PhaseState) -> str:
     """What keeps the virtual body, or each vehicle, from following its trajectory."""
-    if now.pose is None or now.slots is None:
-        return ""
-    pose = now.pose
+    pose, _, slots = now.pose_goal_and_slots
     knots, pieces = phase.pieces
     first = pieces[0, :, :3, :2]
     alone = pieces.shape[1] == 1
-    place = pose.r[None] if alone else pose.r + now.slots @ pose.T
-    speed = pose.v[None] + (0.0 if alone else np.cross(pose.omega, now.slots) @ pose.T)
+    place = pose.r[None] if alone else pose.r + slots @ pose.T
+    speed = pose.v[None] + (0.0 if alone else np.cross(pose.omega, slots) @ pose.T)
     if now.rates is not None and not alone:
         speed = speed + now.rates[0] @ pose.T
     known = phase.travel or phase.duration or (phase.until or 0.0) - now.t

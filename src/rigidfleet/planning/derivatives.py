@@ -8,7 +8,7 @@ tracked (control "tracking"); otherwise there is no slot reference.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+import math
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -16,6 +16,7 @@ from numpy.polynomial import Polynomial
 from rigidfleet.kernel.problem import Motion, Reference, septic_polynomial
 from rigidfleet.math import series
 from rigidfleet.math.piecewise import Piecewise
+from rigidfleet.mission.schema import VehicleYaw
 from rigidfleet.typing import Floats, Ints
 
 #: Number of coefficients of a series: position, velocity, acceleration, jerk, snap.
@@ -30,14 +31,6 @@ _SIDE = 0.5
 _NO_TURN = 1e-14
 #: Step in which yaw "along" is integrated [s]: exact to 1e-9 rad at accelerations of some m/s^2.
 _STEP = 0.01
-
-
-class Yaw(NamedTuple):
-    """How vehicles turn about the vertical. Angle [rad] of "fixed", point (3,) [m] of "towards"."""
-
-    kind: Literal["formation", "fixed", "along", "towards"] = "formation"
-    angle: float = 0.0
-    point: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 def slot_derivatives(
@@ -84,10 +77,9 @@ def slot_taylor(reference: Reference, body: tuple[Floats, Floats], time: Floats)
     """Taylor series (5, 3, N, K) of each slot, from the `body_taylor` at times (K,) [s]; see `slot_derivatives`."""
     cm, axes = body
     if len(reference.knots):
-        return (
-            series.product(slot_way_taylor(reference, time)[: len(cm)], axes, _in_world)
-            + cm[:, :, None]
-        )
+        ways = slot_way_taylor(reference, time)[: len(cm)]
+        slots = series.product(ways, axes.swapaxes(1, 2), _matrix_product).swapaxes(1, 2)
+        return slots + cm[:, :, None]
     s = blend_taylor(time, reference.t0, reference.T_b)[: len(cm)]
     if reference.turn.any():
         turned = series.rotation_series(s[..., None] * reference.turn).transpose(0, 2, 3, 1)
@@ -107,13 +99,8 @@ def slot_way_taylor(reference: Reference, time: Floats) -> Floats:
     return values
 
 
-def _in_world(a: Floats, axes: Floats) -> Floats:
-    """Vectors (..., 3, N, K) in world axes, from (..., N, 3, K) in body axes and ``axes`` (..., 3, 3, K)."""
-    return (axes[..., :, None, :, :] * a[..., None, :, :, :]).sum(axis=-2)
-
-
 def _matrix_product(a: Floats, b: Floats) -> Floats:
-    """Products (..., 3, 3, K) of matrices (..., 3, 3, K)."""
+    """Products (..., N, 3, K) of matrices (..., N, 3, K) and (..., 3, 3, K)."""
     return (a[..., :, :, None, :] * b[..., None, :, :, :]).sum(axis=-3)
 
 
@@ -154,7 +141,7 @@ def blend_taylor(time: Floats, t0: float, T_b: float) -> Floats:
 
 
 def yaw_derivatives(
-    reference: Reference, motion: Motion, time: Floats, yaw: Yaw, start: Floats | None = None
+    reference: Reference, motion: Motion, time: Floats, yaw: VehicleYaw, start: Floats | None = None
 ) -> Floats:
     """Yaw [rad], its rate [rad/s] and acceleration [rad/s^2] (K, 3, N) of each vehicle at increasing times (K,) [s].
 
@@ -180,7 +167,9 @@ def yaw_derivatives(
     return yaw_derivatives_but_along(body, slots, yaw).transpose(2, 0, 1)
 
 
-def yaw_derivatives_but_along(body: tuple[Floats, Floats], slots: Floats, yaw: Yaw) -> Floats:
+def yaw_derivatives_but_along(
+    body: tuple[Floats, Floats], slots: Floats, yaw: VehicleYaw
+) -> Floats:
     """Yaw with two derivatives (3, N, K) of every kind but "along", see `yaw_derivatives`.
 
     From the `body_taylor` and the `slot_taylor` at the same times.
@@ -188,7 +177,7 @@ def yaw_derivatives_but_along(body: tuple[Floats, Floats], slots: Floats, yaw: Y
     n, times = slots.shape[2:]
     angles = np.zeros((3, n, times))
     if yaw.kind == "fixed":
-        angles[0] = yaw.angle
+        angles[0] = math.radians(yaw.yaw_deg)
         return angles
     if yaw.kind == "formation":
         M = body[1][:3]
@@ -217,7 +206,7 @@ def yaw_along(
     on_grid = slot_taylor(reference, body, grid_time)
     if start is None:
         v = on_grid[1, :2, :, 0]
-        from_body = yaw_derivatives_but_along(body, on_grid, Yaw())[0, :, 0]
+        from_body = yaw_derivatives_but_along(body, on_grid, VehicleYaw())[0, :, 0]
         start = np.where(np.hypot(*v) > SLOW, np.arctan2(v[1], v[0]), from_body)
     terms = np.ascontiguousarray(_yaw_ode_terms(on_grid)[0].transpose(2, 0, 1))  # (times, 3, N)
     between = terms[len(ends) :]

@@ -131,10 +131,9 @@ def _shape_change_path_and_ways(
     """Offsets and ways of a change of shape, as references blend it; None if agents come too near each other."""
     p, q = one.slots, two.slots
     dp, turn = shift_and_rotvec(p, q, mission.fleet.mass, mission.assigned_turn(one.name, two.name))
-    if len(p) > 1:
-        least = closest_approach(p, p + dp, mission.fleet.radius)[0]
-        if least <= 0.0 or least < (mission.limits.separation or 0.0) - _SLACK:
-            return None
+    least = closest_approach(p, p + dp, mission.fleet.radius)[0]
+    if least <= 0.0 or least < (mission.limits.separation or 0.0) - _SLACK:
+        return None
     T = att.dcm_from_euler(np.deg2rad(angles))
 
     def path(share: Floats) -> Floats:

@@ -33,7 +33,7 @@ from rigidfleet.planning.legs import Leg, depart, leg_from, leg_of, phase_spans
 from rigidfleet.planning.limits import use_of_limits
 from rigidfleet.planning.preview import FEWEST_SAMPLES, sample_leg
 from rigidfleet.planning.reference import PhaseState
-from rigidfleet.planning.timing import timed_leg
+from rigidfleet.planning.timing import legs_from
 from rigidfleet.typing import Floats
 
 #: Greatest acceleration of the descent [m/s^2].
@@ -55,20 +55,6 @@ class Answer(NamedTuple):
     legs: list[Leg]
     problem: str = ""
     promise: float | None = None
-
-
-def legs_from(
-    mission: Mission, now: PhaseState, phases: Sequence[Phase], number: int = 0
-) -> list[Leg]:
-    """The legs of phases in a row, of which the first has a number, from the state at its start, as far as known."""
-    legs: list[Leg] = []
-    for k, phase in enumerate(phases, start=number):
-        leg = timed_leg(mission, phase, now, k)
-        if not leg.has_known_ways:
-            break
-        legs.append(leg)
-        now = leg.planned_end_state
-    return legs
 
 
 def answer_to_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg]]) -> Answer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,22 +48,21 @@ class PlannedPhase:
     path_ends: tuple[Floats, Floats] | None = None
 
 
-def preview_phases(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPhase], bool]:
-    """One `PlannedPhase` for each phase, or for the first ``phases``, and whether the plan is known to its end."""
+def preview_phases(mission: Mission, legs: Sequence[Leg] = ()) -> tuple[list[PlannedPhase], bool]:
+    """One `PlannedPhase` for each phase, the first by their ``legs``, and whether the plan is known to its end."""
     planned: list[PlannedPhase] = []
     most = samples_per_phase(mission)
     # If even the fewest samples of all phases are too many, only the first phases.
     possible = len(mission.phases) * min(most, FEWEST_SAMPLES) // FEWEST_SAMPLES
     most = max(most, FEWEST_SAMPLES)
-    wanted = mission.phases[:phases]
     now = state_at_start(mission)
-    for phase in wanted[:possible]:
-        leg = leg_of(mission, phase, now)
+    for k, phase in enumerate(mission.phases[:possible]):
+        leg = legs[k] if k < len(legs) else leg_of(mission, phase, now)
         if not leg.has_known_ways:
             return planned, False
         now = leg.planned_end_state
         planned.append(sample_leg(leg, most))
-    return planned, len(planned) == len(wanted)
+    return planned, len(planned) == len(mission.phases)
 
 
 def sample_leg(leg: Leg, most: int) -> PlannedPhase:

@@ -33,8 +33,6 @@ class ByEdge:
         """Values (m,) of edges (m, 2), i < j; for new edges ``other``, (m,) or of so many flights (B, m)."""
         if arrays_equal(edges, self.edges):  # most phases have those of the phase before
             return self.values.copy()
-        if not len(self.edges):  # as at the start of every flight
-            return np.zeros(len(edges)) + other()
         keys, own = _edge_codes(edges), _edge_codes(self.edges)
         order = np.argsort(own)
         at = np.append(order, len(order))[np.searchsorted(own, keys, sorter=order)]

@@ -7,7 +7,7 @@ The least time of a phase is the shortest in which its reference keeps every lim
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -53,7 +53,12 @@ def expand_mission(mission: Mission) -> Mission:
     MissionError
         No transition keeps the separation, or no way is found.
     """
-    return ways.find_ways(expand_phases(mission, timed_leg), timed_leg)
+    return _expanded_mission_and_legs(mission)[0]
+
+
+def _expanded_mission_and_legs(mission: Mission) -> tuple[Mission, list[Leg]]:
+    """`expand_mission`, and the legs by which that is planned: of its first phases."""
+    return ways.find_ways(*expand_phases(mission, legs_up_to), legs_up_to)
 
 
 def can_affect_plan(mission: Mission, keys: Keys) -> bool:
@@ -84,13 +89,16 @@ def complete_times(mission: Mission) -> Mission:
         No transition keeps the separation, no time of a phase keeps the limits, its start is not known before the
         flight, a phase ends too early for the times before it, or vehicles end in motion that the next does not go on.
     """
-    mission = expand_mission(mission)
+    return timed_mission_and_legs(mission)[0]
+
+
+def timed_mission_and_legs(mission: Mission) -> tuple[Mission, list[Leg]]:
+    """`complete_times`, and the legs from which the times follow: of its first phases."""
+    mission, legs = _expanded_mission_and_legs(mission)
     last = max(
         (k for k, phase in enumerate(mission.phases) if phase.auto_keys or phase.follows_curves),
-        default=None,
+        default=-1,
     )
-    if last is None:
-        return mission
     changes: dict[int, dict[str, Any]] = {}
     now = state_at_start(mission)
     for k, phase in enumerate(mission.phases[: last + 2]):
@@ -99,9 +107,11 @@ def complete_times(mission: Mission) -> Mission:
             raise ways.error_of_key(mission, k, "kind", None, problem, remedy)
         if k > last:
             break
-        report_step(f"timing '{phase.name}'")
-        leg = timed_leg(mission, phase, now, k)
-        if leg.phase is not phase:
+        if k == len(legs):
+            report_step(f"timing '{phase.name}'")
+            legs.append(timed_leg(mission, phase, now, k))
+        leg = legs[k]
+        if phase.auto_keys:
             times = leg.phase.model_dump(mode="json", include={*phase.auto_keys, "through"})
             changes[k] = {key: x for key, x in times.items() if x or key != "through"}
         if not leg.has_known_ways:
@@ -112,10 +122,29 @@ def complete_times(mission: Mission) -> Mission:
             )
             raise ways.error_of_key(mission, k, "formation", name, problem, remedy)
         now = leg.planned_end_state
-    if not changes:  # its times may be known already, while its text has the automatic ones
-        return mission
-    tables = mission.to_dict()["phases"]
-    return mission.with_phases([x | changes.get(k, {}) for k, x in enumerate(tables)])
+    if changes:  # its times may be known already, while its text has the automatic ones
+        tables = mission.to_dict()["phases"]
+        mission = mission.with_phases([x | changes.get(k, {}) for k, x in enumerate(tables)])
+    return mission, legs
+
+
+def legs_up_to(mission: Mission, end: int, legs: Sequence[Leg] = ()) -> list[Leg]:
+    """The legs of a mission's first phases up to a number, as far as known, of which some are planned already."""
+    now = legs[-1].planned_end_state if legs else state_at_start(mission)
+    return [*legs, *legs_from(mission, now, mission.phases[len(legs) : end], len(legs))]
+
+
+def legs_from(
+    mission: Mission, now: PhaseState, phases: Sequence[Phase], number: int = 0
+) -> list[Leg]:
+    """The legs of phases in a row, of which the first has a number, from the state at its start, as far as known."""
+    legs: list[Leg] = []
+    for k, phase in enumerate(phases, start=number):
+        if phase.replaced or not (leg := timed_leg(mission, phase, now, k)).has_known_ways:
+            break
+        legs.append(leg)
+        now = leg.planned_end_state
+    return legs
 
 
 def timed_leg(

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from rigidfleet.math.rigid_body import about_cm
+from rigidfleet.mission.schema import IntegratorOptions
 from rigidfleet.typing import Floats
-
-if TYPE_CHECKING:
-    from rigidfleet.mission.schema import IntegratorOptions
-
 
 #: A phase has stalled if it takes more steps than the first number plus the second per second of mission
 #: time, or more than the third in all. Steps of 1 ms already mean gains above 1e3 /s.

@@ -1,10 +1,10 @@
 """Transfers of labelled vehicles through a crowd: bent ways found together, and proved.
 
 Where vehicles are dense, neither straight ways nor layers fit. Here all ways are uniform cubic B-splines of one
-duration, from rest to rest. Their control points minimise penalties of what is broken: the distance of pairs at
-samples, the box, speed and acceleration; then the ways are proved. Speed and acceleration of a B-spline are bounded by
-differences of its control points, so that limits per axis and the box hold between samples, too. The distance of pairs
-is bounded in continuous time by conservative advancement on the ways themselves
+duration, from rest to rest. Their control points lie in the box and minimise penalties of what is broken: the distance
+of pairs at samples, speed and acceleration; then the ways are proved. Speed and acceleration of a B-spline are bounded
+by differences of its control points, so that limits per axis and the box hold between samples, too. The distance of
+pairs is bounded in continuous time by conservative advancement on the ways themselves
 (`rigidfleet.planning.certificate.prove_ways`).
 
 The penalty methods are those of trajectory optimisation with B-splines, e.g. Zhou et al., Robust and efficient
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.formation.assignment import closest_approach
-from rigidfleet.math.piecewise import CUBIC, Piecewise
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.planning.certificate import Certificate, prove_ways
 from rigidfleet.typing import Floats
 
@@ -31,8 +31,8 @@ _SPANS, _SAMPLES, _PASSED = 16, 3, 2.0
 _SHARE = np.clip((np.arange(_SPANS + 3) - 2) / (_SPANS - 2), 0.0, 1.0)[:, None, None]
 #: Durations tried, as multiples of the slowest single vehicle's, and random starts of each, before one roundabout.
 _SLOWER, _STARTS = (1.5, 1.8, 2.1, 2.4), 2
-#: Weights of distances, speed, acceleration and box; of smoothness. Distances are wanted this much larger.
-_WEIGHTS, _SMOOTH, _SPARE = (20.0, 2.0, 2.0, 20.0), 1e-3, 1.04
+#: Weights of distances, and of speed and acceleration; of smoothness. Distances are wanted this much larger.
+_WEIGHTS, _SMOOTH, _SPARE = (20.0, 2.0), 1e-3, 1.04
 #: Greatest random displacement of a control point at the start, as a multiple of the distance to keep.
 _NOISE = 1.0
 #: Duration [s] where nobody has to move.
@@ -60,13 +60,10 @@ def least_duration(
     start: ArrayLike, goal: ArrayLike, speed: ArrayLike, acceleration: ArrayLike
 ) -> float:
     """Least time [s] in which the slowest vehicle alone goes from rest to rest, with limits on each axis."""
-    s, g = (np.asarray(x, dtype=np.float64) for x in (start, goal))
-    way = np.abs(g - s)
-    v, a = np.broadcast_to(speed, 3), np.broadcast_to(acceleration, 3)
-    slow = 2.0 * np.sqrt(way / a)
-    with np.errstate(invalid="ignore"):
-        fast = np.where(way > v**2 / a, way / v + v / a, slow)
-    return float(np.maximum(fast, 0.0).max())
+    way = np.abs(np.subtract(goal, start))
+    v, a = np.asarray(speed), np.asarray(acceleration)
+    fast = way / v + v / a
+    return float(np.where(way > v**2 / a, fast, 2.0 * np.sqrt(way / a)).max())
 
 
 def plan_transfer(
@@ -140,15 +137,6 @@ class _Limits(NamedTuple):
     metric: Floats
 
 
-def _b_spline_weights(u: Floats, spans: int) -> Floats:
-    """Weights (K, M + 3) of the control points at parameters u (K,) in [0, M]."""
-    k = np.minimum(u.astype(np.int64), spans - 1)
-    x = u - k
-    B = np.zeros((len(u), spans + 3))
-    B[np.arange(len(u))[:, None], k[:, None] + np.arange(4)] = x[:, None] ** np.arange(4) @ CUBIC.T
-    return B
-
-
 def _half_ellipse_control_points(start: Floats, goal: Floats) -> Floats:
     """Control points (M + 3, N, 3) of ways that all keep to the right, seen from above on half an ellipse.
 
@@ -161,20 +149,21 @@ def _half_ellipse_control_points(start: Floats, goal: Floats) -> Floats:
 
 def _descend(control: Floats, duration: float, limits: _Limits, rng: np.random.Generator) -> Floats:
     """Control points (M + 3, N, 3) with little penalty, from those of other ways; their ends stay."""
-    from scipy.optimize import minimize
+    from scipy.optimize import Bounds, minimize
 
     n, h = control.shape[1], duration / _SPANS
     control = control.copy()
     longest = float(np.linalg.norm(control[-1] - control[0], axis=1).max())
     each = max(_SAMPLES, math.ceil(_PASSED * longest / (_SPANS * limits.distance)))
-    B = _b_spline_weights(np.linspace(0.0, _SPANS, _SPANS * each + 1), _SPANS)
+    # Weights of the control points: each one's own spline.
+    B = Piecewise.b_spline(np.eye(_SPANS + 3), 1.0).at(np.linspace(0.0, 1.0, _SPANS * each + 1))
     free = slice(3, _SPANS)
     share = np.linspace(0.0, 1.0, _SPANS - 1)[1:-1, None, None]
     noise = rng.uniform(-1, 1, (1, n, 3)) * (_NOISE * limits.distance / limits.metric)
     control[free] += 4.0 * share * (1 - share) * noise
     shape = control[free].shape
     near = (_SPARE * limits.distance) ** 2
-    w_near, w_speed, w_acceleration, w_box = _WEIGHTS
+    w_near, w_fast = _WEIGHTS
     itself = np.arange(n)
 
     def penalty(y: Floats) -> tuple[float, Floats]:
@@ -189,38 +178,27 @@ def _descend(control: Floats, duration: float, limits: _Limits, rng: np.random.G
         cost = 0.5 * w_near / near**2 * float((miss * miss).sum())
         push = x * miss.sum(axis=2)[:, :, None] - miss @ x
         slope -= np.tensordot(B.T, (4.0 * w_near / near**2) * push * limits.metric, axes=1)
-        for order, most, weight in (
-            (1, limits.speed * h, w_speed),
-            (2, limits.acceleration * h * h, w_acceleration),
+        for order, most, smooth in (
+            (1, limits.speed * h, 0.0),
+            (2, limits.acceleration * h * h, _SMOOTH),
         ):
             d = np.diff(control, order, axis=0) / most
             over = np.sign(d) * np.maximum(np.abs(d) - 0.99, 0.0)
-            cost += weight * float((over * over).sum())
-            rise = 2.0 * weight * over / most
-            slope -= _negative_difference_adjoint(rise, order)
-            if order == 2:
-                cost += _SMOOTH * float((d * d).sum())
-                slope -= _negative_difference_adjoint(2.0 * _SMOOTH * d / most, order)
-        out = np.maximum(control - limits.high, 0.0) + np.minimum(control - limits.low, 0.0)
-        cost += w_box * float((out * out).sum())
-        slope += 2.0 * w_box * out
+            cost += float((w_fast * over * over + smooth * d * d).sum())
+            rise = 2.0 * (w_fast * over + smooth * d) / most
+            # The transpose of differences are those of what ends in zeros, of odd order with the other sign.
+            ends = (order, order), (0, 0), (0, 0)
+            slope += (-1.0) ** order * np.diff(np.pad(rise, ends), order, axis=0)
         return cost, slope[free].ravel()
 
-    bounds = [
-        (a, b) for _ in range(shape[0] * n) for a, b in zip(limits.low, limits.high, strict=True)
-    ]
+    # No place within the bounds is out of the box.
+    bounds = Bounds(*(np.tile(corner, shape[0] * n) for corner in (limits.low, limits.high)))
     optimum = minimize(
         penalty, control[free].ravel(), jac=True, method="L-BFGS-B", bounds=bounds,
         options={"maxiter": _ITERATIONS, "maxcor": 20},
     )  # fmt: skip
     control[free] = optimum.x.reshape(shape)
     return control
-
-
-def _negative_difference_adjoint(rise: Floats, order: int) -> Floats:
-    """The negative transpose of differences of an order, applied to slopes of them."""
-    turned = np.diff(np.pad(rise, ((order, order), (0, 0), (0, 0))), order, axis=0)
-    return turned if order == 1 else -turned
 
 
 def _keeps_limits(control: Floats, duration: float, limits: _Limits) -> bool:

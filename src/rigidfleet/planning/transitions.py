@@ -23,10 +23,10 @@ from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Reshape, Vertical
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning.abort import Aborts, Step, first_free_level, neighbours_on_ways, phases_of
-from rigidfleet.planning.legs import state_at_start
+from rigidfleet.planning.legs import Leg, state_at_start
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.transfers import plan_transfer
-from rigidfleet.planning.ways import Timed, error_of_key
+from rigidfleet.planning.ways import LegsUpTo, error_of_key
 from rigidfleet.typing import Floats
 
 #: What the parts of a transition are called.
@@ -39,14 +39,14 @@ _ROOM = 2.0
 _SLACK = 1e-9
 
 
-def expand_phases(mission: Mission, timed: Timed) -> Mission:
+def expand_phases(mission: Mission, legs_up_to: LegsUpTo) -> tuple[Mission, list[Leg]]:
     """Return the mission with each phase that is flown as several in their place; itself if it has none.
 
     A transition by layers becomes three phases, a staggered take-off or landing one for each group of vehicles; one by
     bent ways has their control points.
 
-    The result is an ordinary mission: it can be written, read and flown by itself. ``timed`` gives a phase its
-    automatic times (`timing.timed_leg`).
+    The result is an ordinary mission: it can be written, read and flown by itself. Beside it are the legs of its first
+    phases, up to the last one whose start has to be known; ``legs_up_to`` plans them (`timing.legs_up_to`).
 
     Raises
     ------
@@ -55,26 +55,35 @@ def expand_phases(mission: Mission, timed: Timed) -> Mission:
         staggered phase have no time, or would be under way together.
     """
     if all(phase.flown_as_written for phase in mission.phases):
-        return mission
+        return mission, []
     data, tables, forms = mission.to_dict(), [], {}
     before: str | None = None
+    legs: list[Leg] = []
+
+    def state_after_tables() -> PhaseState | None:
+        """The state after the phases so far; None where it is known only in flight."""
+        nonlocal legs
+        if not tables:
+            return state_at_start(mission)
+        so_far = {"phases": tables, "formations": data["formations"] | forms}
+        legs = legs_up_to(mission.rewritten(data | so_far), len(tables), legs)
+        return legs[-1].planned_end_state if len(legs) == len(tables) else None
+
     for k, phase in enumerate(mission.phases):
         table = data["phases"][k] | {"name": phase.name}
         table.pop("transition", None)
         parts = [table]
         if not phase.flown_as_written:
-            so_far = data | {"phases": tables, "formations": data["formations"] | forms}
-            state = partial(_state_after, mission, so_far, timed)
             expand = _expand_transition if phase.vertical is None else _expand_stagger
-            parts, levels = expand(mission, k, table, cast(Any, phase), before, state)
+            parts, levels = expand(mission, k, table, cast(Any, phase), before, state_after_tables)
             forms |= levels
         tables += parts
         before = before if phase.shaping is None else phase.shaping.formation
     data |= {"phases": tables, "formations": data["formations"] | forms}
-    return mission.rewritten(data)
+    return mission.rewritten(data), legs
 
 
-#: The state at the start of a phase (`_state_after`).
+#: The state at the start of a phase; None where it is known only in flight.
 _State = Callable[[], PhaseState | None]
 #: Tables of the phases that take the place of one, and the formations that they take on the way.
 _Parts = tuple[list[dict[str, Any]], dict[str, Any]]
@@ -163,19 +172,6 @@ def _phases_to_own_places(
     last = parts[-1].model_copy(update={"duration": steps[-1].duration + max(spare, 0.0)})
     keep = {key: x for key, x in table.items() if key in ("control", "input_force")}
     return [keep | x.model_dump(mode="json", exclude_unset=True) for x in (*parts[:-1], last)]
-
-
-def _state_after(mission: Mission, so_far: dict[str, Any], timed: Timed) -> PhaseState | None:
-    """The state after phases ``so_far``; None where it is known only in flight."""
-    now, tables = state_at_start(mission), so_far["phases"]
-    if tables:
-        mission = mission.rewritten(so_far)
-    for number, phase in enumerate(mission.phases[: len(tables)]):
-        leg = None if phase.replaced else timed(mission, phase, now, number)
-        if leg is None or not leg.has_known_ways:
-            return None
-        now = leg.planned_end_state
-    return now
 
 
 def _slot_limits(mission: Mission, now: PhaseState | None) -> Floats:

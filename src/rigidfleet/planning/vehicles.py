@@ -20,9 +20,9 @@ from rigidfleet.math import series
 from rigidfleet.math.margins import Lag, LoopGains, tracking_lag_time
 from rigidfleet.math.quadrotor import ROTORS
 from rigidfleet.mission import Mission
+from rigidfleet.mission.schema import VehicleYaw
 from rigidfleet.mission.vehicles import VehicleModel
 from rigidfleet.planning.derivatives import (
-    Yaw,
     blend_taylor,
     body_taylor,
     slot_derivatives,
@@ -272,7 +272,7 @@ class TickTables:
         self.flight, self.n = flight, mission.n_agents
         self.rate = mission.autopilot.rate
         self.noise = mission.all_disturbances.noise
-        self.yaw = commanded_yaw(mission)
+        self.yaw = mission.yaw
         self.linear_drag = np.array([model.linear_drag for model in mission.vehicle_models or ()])
         self.compensated = mission.autopilot.delay_compensation
         #: What states were last measured about: the problem of the path, or a point to stay at.
@@ -409,12 +409,6 @@ class TickTables:
         return _by_tick(jerk), _by_tick(snap)
 
 
-def commanded_yaw(mission: Mission) -> Yaw:
-    """The yaw that a mission asks of its vehicles."""
-    yaw = mission.yaw
-    return Yaw(yaw.kind, math.radians(yaw.yaw_deg), yaw.point or (0.0, 0.0, 0.0))
-
-
 def initial_yaw_and_rate(mission: Mission) -> Floats:
     """Yaw and its rate (2, N) [rad, rad/s] with which vehicles start."""
     start, frame = np.zeros((2, mission.n_agents)), mission.body_frame
@@ -430,7 +424,7 @@ class YawTurn(NamedTuple):
     off: Floats  # (2, N) what these differ by from those asked for
 
 
-def yaw_turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> YawTurn:
+def yaw_turn_from(problem: Problem, t: float, yaw: VehicleYaw, start: Floats) -> YawTurn:
     """The turn of vehicles with yaws and rates ``start`` (2, N) at a time [s] of a problem, at which its motion begins.
 
     Where no slots are tracked, they keep their yaw.
@@ -441,7 +435,9 @@ def yaw_turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> YawTur
     return yaw_turn(problem.reference, problem.motion, t, yaw, start)
 
 
-def yaw_turn(reference: Reference, motion: Motion, t: float, yaw: Yaw, start: Floats) -> YawTurn:
+def yaw_turn(
+    reference: Reference, motion: Motion, t: float, yaw: VehicleYaw, start: Floats
+) -> YawTurn:
     """`yaw_turn_from` while slots are tracked."""
     if yaw.kind == "along":
         return YawTurn(t, start, np.zeros_like(start))
@@ -453,7 +449,7 @@ def yaw_turn(reference: Reference, motion: Motion, t: float, yaw: Yaw, start: Fl
 
 
 def slot_taylor_and_yaw(
-    reference: Reference, motion: Motion, time: Floats, yaw: Yaw, turn: YawTurn
+    reference: Reference, motion: Motion, time: Floats, yaw: VehicleYaw, turn: YawTurn
 ) -> tuple[Floats, Floats, tuple[float, Floats] | None]:
     """Series of the slots (5, 3, N, K), and the yaw with two derivatives (3, N, K) that is asked of the vehicles.
 

@@ -8,7 +8,7 @@ planned reference of every vehicle (`rigidfleet.planning.clearance`). If the pro
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any, cast
@@ -19,7 +19,7 @@ from rigidfleet._common.progress import report_step
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
-from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import ANGLES, Go
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import layers
@@ -27,12 +27,11 @@ from rigidfleet.planning.clearance import clearance_to, speed_bounds
 from rigidfleet.planning.lattice import FreeSpace, Layer, Roadmap, Stops, constant_path
 from rigidfleet.planning.legs import Leg, latest_end, state_at_start
 from rigidfleet.planning.preview import FEWEST_SAMPLES, sample_leg, samples_per_phase
-from rigidfleet.planning.reference import PhaseState
 from rigidfleet.solids.records import box_corners, swept_extent
 from rigidfleet.typing import Floats
 
-#: The leg of a phase with its automatic times known, from the mission, the phase, the state at its start, its number.
-Timed = Callable[[Mission, Phase, PhaseState, int], Leg]
+#: The legs of a mission's first phases up to a number, with their automatic times known, of which some are known.
+LegsUpTo = Callable[[Mission, int, Sequence[Leg]], list[Leg]]
 
 #: Greatest speed at the start of a way [m/s]: what regulators leave.
 _REST = 0.1
@@ -48,10 +47,13 @@ _SHORT, _FEW = 1.2, 6
 _KEPT = 2e-3
 
 
-def find_ways(mission: Mission, timed: Timed) -> Mission:
+def find_ways(
+    mission: Mission, legs: Sequence[Leg], legs_up_to: LegsUpTo
+) -> tuple[Mission, list[Leg]]:
     """Return the mission with each phase of kind "go" replaced by those of a way; itself if it has none.
 
-    The result is an ordinary mission: it can be written, read and flown by itself.
+    The result is an ordinary mission: it can be written, read and flown by itself. Beside it are the legs of its first
+    phases, which are proved, after those that there are.
 
     Raises
     ------
@@ -59,25 +61,22 @@ def find_ways(mission: Mission, timed: Timed) -> Mission:
         There is no way, none was found that can be proved, or a phase cannot begin one.
     """
     while (k := next((k for k, p in enumerate(mission.phases) if p.replaced), None)) is not None:  # fmt: skip
-        now, phase = state_at_start(mission), cast("Go", mission.phases[k])
-        for number, before in enumerate(mission.phases[:k]):
-            leg = timed(mission, before, now, number)
-            if not leg.has_known_ways:
-                raise error_of_key(mission, k, "kind", "go", "begins where distances alone have led",
-                              "give the formation a shape or slots")  # fmt: skip
-            now = leg.planned_end_state
-        mission = _Search(mission, k, phase, now, timed).mission_with_way()
-    return mission
+        legs = legs_up_to(mission, k, legs)
+        if len(legs) < k:
+            raise error_of_key(mission, k, "kind", "go", "begins where distances alone have led",
+                               "give the formation a shape or slots")  # fmt: skip
+        mission, legs = _Search(mission, legs, legs_up_to).mission_with_way_and_legs()
+    return mission, [*legs]
 
 
 class _Search:
-    """The search for the way of one phase."""
+    """The search for the way of one phase, from where the legs before it end."""
 
-    def __init__(
-        self, mission: Mission, number: int, phase: Go, now: PhaseState, timed: Timed
-    ) -> None:
-        self.mission, self.number, self.phase, self.now, self.timed = mission, number, phase, now, timed  # fmt: skip
-        self.mistake = mistake = partial(error_of_key, mission, number)
+    def __init__(self, mission: Mission, legs: Sequence[Leg], legs_up_to: LegsUpTo) -> None:
+        self.mission, self.legs, self.legs_up_to = mission, legs, legs_up_to
+        self.phase = phase = cast("Go", mission.phases[len(legs)])
+        self.now = now = legs[-1].planned_end_state if legs else state_at_start(mission)
+        self.mistake = mistake = partial(error_of_key, mission, len(legs))
         if now.formation is None or now.slots is None:
             remedy = "add a phase of kind 'establish' before"
             raise mistake("kind", "go", "needs a formation that flies there", remedy)
@@ -125,14 +124,14 @@ class _Search:
 
     # -- the search ------------------------------------------------------------------------------------
 
-    def mission_with_way(self) -> Mission:
-        """The mission with the way's phases in place of this one."""
+    def mission_with_way_and_legs(self) -> tuple[Mission, list[Leg]]:
+        """The mission with the way's phases in place of this one, and the legs of its phases to the end of the way."""
         need = self.phase.clearance + _KEPT
         for _ in range(_TRIES):
             best = self._stops_of_cheapest_way(need)
-            mission, lacking = self._mission_and_shortfall(*best)
+            mission, legs, lacking = self._mission_legs_and_shortfall(*best)
             if lacking <= 0.0:
-                return mission
+                return mission, legs
             need += lacking + _KEPT
         problem = f"finds a way, but its proof lacks {lacking:.3f} m of clearance: {self._worst}"
         remedy = "give more time, or ask for less clearance"
@@ -262,9 +261,11 @@ class _Search:
                 del last["duration"]
         return tables
 
-    def _mission_and_shortfall(self, roadmap: Roadmap, stops: Stops) -> tuple[Mission, float]:
-        """The mission with a way, and the clearance [m] that its proof lacks: that of every vehicle, in time."""
-        mission, k = self.mission, self.number
+    def _mission_legs_and_shortfall(
+        self, roadmap: Roadmap, stops: Stops
+    ) -> tuple[Mission, list[Leg], float]:
+        """The mission with a way, its legs, and the clearance [m] that their proof lacks: of every vehicle, in time."""
+        mission, k = self.mission, len(self.legs)
         data, tables = mission.to_dict(), self._phase_tables(roadmap, stops)
         forms = {
             name: mission.formations[name].model_dump(
@@ -279,13 +280,9 @@ class _Search:
             "formations": data["formations"] | dict(sorted(forms.items())),
         }
         tried = mission.rewritten(data)
-        now, lacking = self.now, -math.inf
         self._worst = ""
-        for number in range(k, k + len(tables)):
-            leg = self.timed(tried, tried.phases[number], now, number)
-            now = leg.planned_end_state
-            lacking = max(lacking, self._missing_clearance(tried, leg))
-        return tried, lacking
+        legs = self.legs_up_to(tried, k + len(tables), self.legs)
+        return tried, legs, max(self._missing_clearance(tried, leg) for leg in legs[k:])
 
     def _missing_clearance(self, mission: Mission, leg: Leg) -> float:
         """How much [m] the clearance of a planned leg is below what is asked for; negative if it is kept."""

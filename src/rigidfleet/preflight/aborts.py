@@ -18,8 +18,7 @@ from rigidfleet._common.text import agent_names
 from rigidfleet.mission import Mission
 from rigidfleet.mission.boundaries import Worst
 from rigidfleet.planning.abort import Abort, Aborts
-from rigidfleet.planning.legs import state_at_start
-from rigidfleet.planning.losses import legs_from
+from rigidfleet.planning.timing import legs_up_to, timed_mission_and_legs
 
 
 @dataclass
@@ -148,15 +147,16 @@ def _pair_data(least: float, when: float, *who: int) -> dict[str, Any] | None:
 def check_aborts(
     mission: Mission, *, progress: Callable[[str], None] = lambda _: None
 ) -> AbortsCheck:
-    """Plan an abort of each `abort.step` of a mission whose times are known.
+    """Plan an abort of each `abort.step` of a mission.
 
     Raises
     ------
     MissionError
-        No time of a phase keeps the limits of the mission.
+        No time of a phase keeps the limits of the mission, or another reason of `complete_times`.
     """
     progress("planned paths")
-    aborts = Aborts(mission, legs_from(mission, state_at_start(mission), mission.phases))
+    mission, legs = timed_mission_and_legs(mission)
+    aborts = Aborts(mission, legs_up_to(mission, len(mission.phases), legs))
     every: list[Abort] = []
     unheard: list[list[Worst]] = []
     for abort in aborts.all_aborts():

@@ -8,7 +8,8 @@ import numpy as np
 
 from rigidfleet.formation import assignment
 from rigidfleet.mission import Mission
-from rigidfleet.planning.preview import preview_phases
+from rigidfleet.planning.legs import leg_of
+from rigidfleet.planning.preview import sample_leg
 from rigidfleet.preflight.findings import Assignment, Preflight, Remark
 
 #: A shorter assignment is reported if it saves this fraction of the path length and this length besides [m].
@@ -30,7 +31,8 @@ def assignment_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         other, planned = mission, preflight.flown_phases[index]
         if name not in ("as it is", mission.assignment):
             other = mission.with_assignment(name)
-            planned = preview_phases(other, index + 1)[0][index]
+            leg = leg_of(other, other.phases[index], planned.leg.before)
+            planned = sample_leg(leg, len(planned.time))
         if planned.path_ends is None:  # on bent ways
             return
         x = planned.position - (masses @ planned.position)[:, None] / masses.sum()

@@ -14,7 +14,7 @@ from pathlib import Path
 from rigidfleet.mission import Mission, as_mission
 from rigidfleet.mission.files import notes_on_files
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview_phases, samples_per_phase
-from rigidfleet.planning.timing import complete_times
+from rigidfleet.planning.timing import timed_mission_and_legs
 from rigidfleet.planning.vehicles import lags_by_vehicle, tracking_lag_times
 from rigidfleet.preflight import trajectory
 from rigidfleet.preflight.assignment import assignment_remarks
@@ -52,11 +52,11 @@ def check(
     MissionError
         The mission cannot be read or has errors.
     """
-    mission = complete_times(as_mission(mission))
+    mission, legs = timed_mission_and_legs(as_mission(mission))
     search = mission.n_agents <= SEARCHED if search is None else search
     formations = check_formations(mission, search=search, progress=progress)
     progress("planned paths")
-    planned, known = preview_phases(mission)
+    planned, known = preview_phases(mission, legs)
     flown, rest = parts_before_and_after_loss(mission, planned)
     gains = check_pid_gains(mission, formations)
     preflight = Preflight(mission, formations, gains, planned, flown)

@@ -15,7 +15,6 @@ from rigidfleet.mission.vehicles import VehicleModel
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.vehicles import (
-    commanded_yaw,
     drag_and_lift,
     initial_yaw_and_rate,
     pair_jet_speeds,
@@ -45,7 +44,7 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
     tracked = [planned for planned in way if planned.leg.phase.tracks_slots]
     if models is None or not tracked or all(model.point for model in models):
         return None
-    setting, angle, needs = commanded_yaw(mission), initial_yaw_and_rate(mission), []
+    setting, angle, needs = mission.yaw, initial_yaw_and_rate(mission), []
     for planned in tracked:
         leg, n = planned.leg, mission.n_agents
         count = min(max(_SAMPLES, int((leg.end - leg.start) / _STEP) + 1), _MOST)

@@ -12,7 +12,7 @@ from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.findings import suggest
 from rigidfleet.mission.kinds import AnyPhase
 from rigidfleet.mission.losses import ON_LOSS
-from rigidfleet.planning.timing import timed_leg
+from rigidfleet.planning.timing import legs_up_to
 from rigidfleet.planning.transitions import expand_phases
 from rigidfleet.result import PhaseRecord
 
@@ -68,7 +68,7 @@ def phase_of_table(
     data["phases"] = [*data["phases"], dict(table)]
     made = Mission.from_dict(data, "begin()")
     if not made.phases[-1].flown_as_written:
-        spread = expand_phases(made, timed_leg)
+        spread = expand_phases(made, legs_up_to)[0]
         if len(spread.phases) == len(made.phases):  # with the ways that were found
             made = spread
     _refuse_expanded_phase(made.phases[-1])

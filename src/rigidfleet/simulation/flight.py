@@ -25,10 +25,10 @@ from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
 from rigidfleet.mission.model import part_of_mission
 from rigidfleet.planning.disturbances import mission_disturbance
 from rigidfleet.planning.legs import Leg, state_at_start
-from rigidfleet.planning.losses import Answer, answer_to_loss, legs_from
+from rigidfleet.planning.losses import Answer, answer_to_loss
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, Pose, copy_with
-from rigidfleet.planning.timing import complete_times, timed_leg
+from rigidfleet.planning.timing import complete_times, legs_from, timed_leg
 from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.as_flown import check_phase_can_begin, mission_as_flown, phase_of_table

@@ -18,12 +18,11 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.math.constraint_jacobian import smallest_singular_value
 from rigidfleet.planning.derivatives import (
-    Yaw,
     slot_derivatives,
     slots_by_own_clocks,
     yaw_derivatives,
 )
-from rigidfleet.planning.vehicles import YawTurn, commanded_yaw, slot_taylor_and_yaw
+from rigidfleet.planning.vehicles import YawTurn, slot_taylor_and_yaw
 from rigidfleet.result import CLOSE, LATER, RECORDED, SEEN, Extremum, PhaseRecord, Result
 from rigidfleet.simulation.solver_setup import large_solver, problem_with_solver, workspace_of
 from rigidfleet.typing import Bools, Floats, Ints
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     from rigidfleet.kernel.mail import Links, Mail
     from rigidfleet.kernel.problem import Motion, Problem, Reference, Workspace
     from rigidfleet.mission import Mission
-
+from rigidfleet.mission.schema import VehicleYaw
 
 #: Greatest number of edges, or of coordinates, for which the smallest singular value of J is recorded.
 _SINGULAR = 400
@@ -337,7 +336,7 @@ def _slot_references(
     Yaw "along" continues from piece to piece. Where vehicles have clocks of their own, ``clocks`` says how these stand;
     the yaw is that by their mean, from which they differ by far less than a vehicle needs to turn.
     """
-    turned, n = commanded_yaw(mission), mission.n_agents
+    turned, n = mission.yaw, mission.n_agents
     states, angles = [], []
     last, until, end = None, 0.0, 0
     for times, followed in pieces:
@@ -384,7 +383,7 @@ def _slot_references(
 
 
 def _yaw_and_rate(
-    reference: Reference, motion: Motion, time: Floats, yaw: Yaw, turn: YawTurn
+    reference: Reference, motion: Motion, time: Floats, yaw: VehicleYaw, turn: YawTurn
 ) -> Floats:
     """Yaw and its rate (K, 2, N) asked of vehicles that turn into it from the yaw they had."""
     since = np.concatenate([[turn.begun], time])
