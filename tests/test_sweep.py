@@ -1133,6 +1133,39 @@ def test_a_cluster_loses_a_worker(dask, tmp_path):
 
 
 @pytest.mark.long
+def test_a_worker_of_a_cluster_that_cannot_fly_passes_its_chunks_on(dask, tmp_path, monkeypatch):
+    """One of three Dask workers stays and cannot run the level: all rows come; where none can, one sentence says so."""
+    from distributed import Client
+
+    address, processes = dask
+    monkeypatch.setenv("RIGIDFLEET_LEVEL", "x86-64-v9")
+    processes.append(
+        started(
+            [
+                "worker",
+                address,
+                "--nthreads",
+                "1",
+                "--no-nanny",
+                "--local-directory",
+                str(tmp_path / "bad"),
+            ]
+        )
+    )
+    monkeypatch.delenv("RIGIDFLEET_LEVEL")
+    with Client(address, set_as_default=False) as client:
+        client.wait_for_workers(3)
+    asked = Sweep.of("single-waypoint", SCATTER, runs=200, seed=2)
+    table = fly(asked, tmp_path / "cluster", cluster=address)
+    assert numbers(table) == numbers(fly(asked, tmp_path / "alone", workers=1))
+    for process in processes[1:3]:
+        process.kill()
+    words = r"a worker failed: RIGIDFLEET_LEVEL: this machine cannot run .* 0 of 200 runs are saved"
+    with pytest.raises(RigidfleetError, match=words):
+        fly(asked, tmp_path / "none", cluster=address)
+
+
+@pytest.mark.long
 def test_a_cluster_loses_its_scheduler(dask, tmp_path, capfd):
     """One sentence says what is saved, and nothing else is printed; the sweep then goes on without a cluster."""
     address, (scheduler, *_) = dask
@@ -1324,6 +1357,8 @@ def test_reasons_are_explained():
     assert "mission refused" in text
     assert "run 3: agents.mass = -1.0: must be positive" in text
     assert "program error" in text
+    assert "--force flies all" in text
+    assert "--force" not in shown(made(), 1000)
     assert json.loads(found.json())["examples"]["mission"]["run"] == 3
 
 

@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -23,6 +24,10 @@ from rigidfleet.sweep.run import fly_runs
 
 #: Maximum time to wait for a scheduler [s].
 _CONNECT = 20.0
+#: Number of workers of a cluster that try to fly a chunk.
+_TRIES = 5
+#: Time between looks whether one that was passed on is flown [s].
+_LOOK = 0.1
 
 
 def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
@@ -39,6 +44,36 @@ def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
         raise RigidfleetError(f"it has {flown.version}, and the sweep {version}. {words}.")
     runnable_instruction_level()
     return fly_runs(flown, runs)
+
+
+def fly_chunk_in_cluster(
+    sweep: str, version: str, runs: Sequence[int], tried: tuple[str, ...] = ()
+) -> list[RunRecord]:
+    """Fly a chunk on a worker of Dask. One that cannot passes it on to others, until ``tried`` are `_TRIES` addresses.
+
+    Raises
+    ------
+    RigidfleetError
+        None of them can, for the reason of the last one.
+    """
+    from distributed import get_worker, worker_client
+
+    try:
+        return fly_chunk(sweep, version, runs)
+    except RigidfleetError:
+        tried = (*tried, get_worker().address)
+        if len(tried) == _TRIES:
+            raise
+        with worker_client() as client:
+            if not (others := [x for x in client.nthreads() if x not in tried]):
+                raise
+            chunk = sweep, version, runs, tried
+            future = client.submit(fly_chunk_in_cluster, *chunk, workers=others, pure=False)
+            while not future.done():
+                if client.nthreads().keys().isdisjoint(others):  # it would wait for them for ever
+                    raise
+                time.sleep(_LOOK)
+            return future.result()
 
 
 @contextmanager
