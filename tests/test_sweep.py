@@ -924,6 +924,26 @@ def test_workers_that_cannot_be_are_one_error(keys, error, words, tmp_path):
         fly(sweep(), tmp_path, **keys | ({"pool": pool} if "pool" in keys else {}))
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks")
+def test_a_machine_without_room_for_a_process_says_so(tmp_path, monkeypatch):
+    """Neither a fork nor an executor that starts a process in vain is taken for a cluster that ended."""
+
+    def refuse(*_: Any) -> Any:
+        raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr("rigidfleet.sweep.runner.WORTH", 0.0)
+    monkeypatch.setattr("rigidfleet.sweep.workers._is_fork_safe", lambda: True)
+    monkeypatch.setattr("multiprocessing.process.BaseProcess.start", refuse)
+    with pytest.raises(
+        RigidfleetError, match=r"no process can be started: .*unavailable\. Use fewer"
+    ):
+        fly(sweep(runs=60), tmp_path, workers=2)
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", refuse)
+    words = r"takes no work: BlockingIOError: .*unavailable\. .*: 8 of 60 runs are saved"
+    with ThreadPoolExecutor(1) as pool, pytest.raises(RigidfleetError, match=words):
+        fly(sweep(runs=60), tmp_path, pool=pool, workers=1)
+
+
 def test_a_pool_that_breaks_as_it_is_given_work_loses_none(tmp_path, monkeypatch, caplog):
     """The chunk that a broken pool does not take is flown by the next one; the log says what progress says."""
     from contextlib import contextmanager

@@ -223,10 +223,8 @@ class Show:
         self._origin = getattr(mission.geodetic_origin, "geodetic", None)
         self.curve, self.how, verdict, self.names = self._fly_or_read_ways(mission, drill.files)
         if not verdict.passed:
-            why = next(check.message for check in verdict.checks if not check.passed)
-            raise RigidfleetError(
-                f"drill: the flight fails without any fault: {why}. Mend this first."
-            )
+            why = f"the flight fails without any fault: {verdict.failures[0].message}"
+            raise RigidfleetError(f"drill: {why}. Mend this first.")
         data = judging_mission(self.curve.pieces[0, :, :3, 0], 1.0, mission=mission).to_dict()
         motions = {q.name for q in MOTIONS}  # which a fault leaves as they are
         data["limits"] = {k: x for k, x in data.get("limits", {}).items() if k not in motions}
@@ -300,7 +298,7 @@ class Show:
             return {}, "", ""
         result, every = self.flight_of_vehicles_near_fault(fault)
         verdict = assess(result)
-        failed = [check for check in verdict.checks if not check.passed]
+        failed = verdict.failures
         worst = {c.check: c.worst for c in verdict.checks if c.judged and c.check in METRICS}
         named = {k: x for k, x in enumerate(self.names) if x.removeprefix("agent ") != f"{k + 1}"}
         who = [f"{k + 1} ({named[k]})" if k in named else f"{k + 1}" for k in every.tolist()]

@@ -172,6 +172,6 @@ def _metrics_and_failure(result: Result) -> tuple[dict[str, float], str, str]:
     from rigidfleet.assessment import assess
 
     verdict = assess(result)
-    failed = [f for f in verdict.checks if not f.passed]
+    failed = verdict.failures
     reason = ", ".join(dict.fromkeys(f.check for f in failed))
     return measure_metrics(result, verdict), reason, failed[0].message if failed else ""

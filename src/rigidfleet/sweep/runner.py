@@ -191,7 +191,8 @@ class _Sweeping:
                 return call(*arguments)
             except Exception as error:
                 who = "the executor takes no work" if call == executor.submit else "a worker failed"
-                raise self.failure(pools.why_failed(error, who)) from error
+                in_cluster = job is pools.fly_chunk_in_cluster
+                raise self.failure(pools.why_failed(error, who, in_cluster=in_cluster)) from error
 
         flying: dict[Future[list[RunRecord]], list[int]] = {}
         taken: list[int] = []

@@ -82,6 +82,11 @@ def start_processes(count: int) -> Generator[Executor]:
 
     They are forks of this process where that is safe, as they then begin with all that it has loaded. Elsewhere, each
     starts on its own.
+
+    Raises
+    ------
+    RigidfleetError
+        The machine allows no further process.
     """
     before = set(multiprocessing.active_children())
     forked = _is_fork_safe()
@@ -95,6 +100,11 @@ def start_processes(count: int) -> Generator[Executor]:
                 before_fork = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
                 try:
                     pool.submit(int)
+                except OSError as error:
+                    words = "Use fewer --workers, or --workers 1"
+                    raise RigidfleetError(
+                        f"no process can be started: {error}. {words}."
+                    ) from error
                 finally:
                     signal.pthread_sigmask(signal.SIG_SETMASK, before_fork)
             yield pool
@@ -166,9 +176,9 @@ def open_cluster(address: str) -> Generator[tuple[Executor, Callable[[], int]]]:
         log.setLevel(before)
 
 
-def why_failed(error: Exception, who: str) -> str:
+def why_failed(error: Exception, who: str, *, in_cluster: bool = False) -> str:
     """Why work that was handed to an executor did not come back, and what to do; ``who`` failed, if nobody died."""
-    if isinstance(error, CancelledError | OSError):
+    if in_cluster and isinstance(error, CancelledError | OSError):
         return "the scheduler of the cluster ended, or the connection to it."
     if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # Dask's
         return "workers died. If memory is short, use fewer of them; a script needs `if __name__ == '__main__':`."

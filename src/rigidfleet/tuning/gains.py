@@ -6,13 +6,13 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from rigidfleet._common.toml import to_toml, toml_equals_data
 from rigidfleet.math import lqr, pid
-from rigidfleet.math.margins import Loop, LoopGains, Margins, stability_margins
+from rigidfleet.math.margins import Margins, stability_margins
 from rigidfleet.mission import Mission
 from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.schema import Tracking
@@ -44,8 +44,8 @@ _TRIES = 30
 _ROUNDING = 1e-9
 #: Table of the gains of the constraint law.
 _LAW = "constraint."
-#: Names of the two laws, as `check` has them.
-_TRACKING, _CONSTRAINT = "tracking", "constraint law"
+#: Name of the law of all shapes together; that of the tracking is "tracking", as `check` has it.
+_CONSTRAINT = "constraint law"
 
 
 def own_gains(mission: Mission) -> Gains:
@@ -88,16 +88,6 @@ def _to_four_digits(gain: float) -> float:
     return float(f"{gain:.4g}")
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A distinct part of a loop, whichever shapes have it."""
-
-    name: str
-    loop: Loop
-    law: LoopGains
-    growth: float
-
-
 class Screen:
     """Margins of the laws of a mission with other gains, to refuse gains before they fly.
 
@@ -111,12 +101,11 @@ class Screen:
         self.mission, self.share = mission, share
         self.gains = own_gains(mission)
         lags = lags_by_vehicle(mission)
-        laws: list[tuple[str, ClosedLoops]] = []
+        laws: list[ClosedLoops] = []
         if lags:
             tracking = tracking_closed_loops(mission, lags)
-            laws += [] if tracking is None else [(_TRACKING, tracking)]
             looped, _ = loops_and_omission(mission, preview_phases(mission)[0], lags)
-            laws += [(_CONSTRAINT, law) for law in looped]
+            laws = [*filter(None, [tracking]), *(x._replace(where=_CONSTRAINT) for x in looped)]
         self.parts = _distinct_loop_parts(laws)
         self.own = self.margins_by_law(self.gains)
 
@@ -148,20 +137,20 @@ class Screen:
         k1, k2 = lqr.double_integrator_gains(Q, t.R)
         new = {"k1": k1, "k2": k2, "ki": gains.get("tracking.integral", t.integral)}
         new |= {k.removeprefix(_LAW): x for k, x in gains.items() if k.startswith(_LAW)}
-        for part in self.parts:
-            yield part.name, stability_margins([part.loop], replace(part.law, **new), part.growth)
+        for law, loops, own, growth in self.parts:
+            yield law, stability_margins(loops, replace(own, **new), growth)
 
 
-def _distinct_loop_parts(laws: Sequence[tuple[str, ClosedLoops]]) -> list[_Part]:
+def _distinct_loop_parts(laws: Sequence[ClosedLoops]) -> list[ClosedLoops]:
     """The distinct parts of all loops: most shapes have the same, and what decays on the longest way counts."""
-    parts: dict[object, _Part] = {}
-    for name, looped in laws:
+    parts: dict[object, ClosedLoops] = {}
+    for looped in laws:
         for loop in looped.loops:
             rounded = ((np.round(x, 9) + 0.0).tobytes() for x in (loop.S, loop.Q, loop.P))
-            key = (name, *rounded, loop.channels, looped.law)
+            key = (looped.where, *rounded, loop.channels, looped.law)
             if key not in parts or looped.growth < parts[key].growth:
-                parts[key] = _Part(name, loop, looped.law, looped.growth)
-    return sorted(parts.values(), key=lambda part: part.loop.S.size)  # the quick ones first
+                parts[key] = looped._replace(loops=[loop])
+    return sorted(parts.values(), key=lambda part: part.loops[0].S.size)  # the quick ones first
 
 
 def _margin_ratio(now: Margins, was: Margins) -> float:
