@@ -14,6 +14,7 @@ from test_logs import log as log_file
 import rigidfleet as rf
 from rigidfleet._common.facts import FactTable
 from rigidfleet.cli.app import main
+from rigidfleet.foreign import files
 from rigidfleet.sweep import Sweep, faults, figures, fly, load
 from rigidfleet.sweep.faults import Drill, GeometricFault, Show
 from rigidfleet.sweep.run import fly_runs
@@ -449,7 +450,12 @@ def test_the_command_tells_notes_on_files_of_a_sweep_file_once(tmp_path, capsys,
     Path("drill.toml").write_text(
         drill + 'files = ["now.csv"]\nstale = ["before.csv", "two-agents"]\n'
     )
+    read, reader = [], files.read_trajectories
+    monkeypatch.setattr(
+        files, "read_trajectories", lambda x, **how: read.append(x) or reader(x, **how)
+    )
     assert main(["sweep", "drill.toml", "--no-figures", "--quiet"]) == 0
+    assert read == [(str(tmp_path / "now.csv"),), (str(tmp_path / "before.csv"),)]
     err = capsys.readouterr().err
     for name in ("now.csv", "before.csv"):
         words = f"warning: {tmp_path / name}: no unit is said: times as s, places as m."

@@ -924,6 +924,26 @@ def test_workers_that_cannot_be_are_one_error(keys, error, words, tmp_path):
         fly(sweep(), tmp_path, **keys | ({"pool": pool} if "pool" in keys else {}))
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks")
+def test_a_machine_without_room_for_a_process_says_so(tmp_path, monkeypatch):
+    """Neither a fork nor an executor that starts a process in vain is taken for a cluster that ended."""
+
+    def refuse(*_: Any) -> Any:
+        raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr("rigidfleet.sweep.runner.WORTH", 0.0)
+    monkeypatch.setattr("rigidfleet.sweep.workers._is_fork_safe", lambda: True)
+    monkeypatch.setattr("multiprocessing.process.BaseProcess.start", refuse)
+    with pytest.raises(
+        RigidfleetError, match=r"no process can be started: .*unavailable\. Use fewer"
+    ):
+        fly(sweep(runs=60), tmp_path, workers=2)
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", refuse)
+    words = r"takes no work: BlockingIOError: .*unavailable\. .*: 8 of 60 runs are saved"
+    with ThreadPoolExecutor(1) as pool, pytest.raises(RigidfleetError, match=words):
+        fly(sweep(runs=60), tmp_path, pool=pool, workers=1)
+
+
 def test_a_pool_that_breaks_as_it_is_given_work_loses_none(tmp_path, monkeypatch, caplog):
     """The chunk that a broken pool does not take is flown by the next one; the log says what progress says."""
     from contextlib import contextmanager
@@ -1133,6 +1153,39 @@ def test_a_cluster_loses_a_worker(dask, tmp_path):
 
 
 @pytest.mark.long
+def test_a_worker_of_a_cluster_that_cannot_fly_passes_its_chunks_on(dask, tmp_path, monkeypatch):
+    """One of three Dask workers stays and cannot run the level: all rows come; where none can, one sentence says so."""
+    from distributed import Client
+
+    address, processes = dask
+    monkeypatch.setenv("RIGIDFLEET_LEVEL", "x86-64-v9")
+    processes.append(
+        started(
+            [
+                "worker",
+                address,
+                "--nthreads",
+                "1",
+                "--no-nanny",
+                "--local-directory",
+                str(tmp_path / "bad"),
+            ]
+        )
+    )
+    monkeypatch.delenv("RIGIDFLEET_LEVEL")
+    with Client(address, set_as_default=False) as client:
+        client.wait_for_workers(3)
+    asked = Sweep.of("single-waypoint", SCATTER, runs=200, seed=2)
+    table = fly(asked, tmp_path / "cluster", cluster=address)
+    assert numbers(table) == numbers(fly(asked, tmp_path / "alone", workers=1))
+    for process in processes[1:3]:
+        process.kill()
+    words = r"a worker failed: RIGIDFLEET_LEVEL: this machine cannot run .* 0 of 200 runs are saved"
+    with pytest.raises(RigidfleetError, match=words):
+        fly(asked, tmp_path / "none", cluster=address)
+
+
+@pytest.mark.long
 def test_a_cluster_loses_its_scheduler(dask, tmp_path, capfd):
     """One sentence says what is saved, and nothing else is printed; the sweep then goes on without a cluster."""
     address, (scheduler, *_) = dask
@@ -1324,6 +1377,8 @@ def test_reasons_are_explained():
     assert "mission refused" in text
     assert "run 3: agents.mass = -1.0: must be positive" in text
     assert "program error" in text
+    assert "--force flies all" in text
+    assert "--force" not in shown(made(), 1000)
     assert json.loads(found.json())["examples"]["mission"]["run"] == 3
 
 

@@ -21,7 +21,7 @@ from rigidfleet.errors import ResultError, RigidfleetError, SweepError
 from rigidfleet.sweep import Sweep, metrics, read
 from rigidfleet.tuning.gains import RANGES, GainSpace, Screen, own_gains, with_gains
 from rigidfleet.tuning.outcome import Flown
-from rigidfleet.tuning.study import OBJECTIVES, _Study, objective_cost
+from rigidfleet.tuning.study import OBJECTIVES, _seed_paths, _Study, objective_cost
 
 TEXT = """# a pair of quadrotors
 schema_version = 1
@@ -169,6 +169,27 @@ def test_margins_are_those_of_check():
     assert Screen(PAIR, 0.0).margin_slack(own | {"constraint.gamma": 300.0}) == -1  # unstable
 
 
+def test_margins_without_tracked_slots_are_those_of_check():
+    """Where one law leads the virtual body, whose gains are not tuned, its integral counts as `check` counts it."""
+    text = TEXT.replace('smoothness = "jerk"', 'architecture = "body"')
+    mission = rf.Mission.from_toml(f"{text}\n[tracking]\nintegral = 3.0\n")
+    assert own_gains(mission).keys() == {"constraint.alpha", "constraint.beta", "constraint.gamma"}
+    found = rf.check(mission).margins
+    assert found is not None
+    low = max(f.margins.gain[0] for f in found.formations.values())
+    assert Screen(mission, 1.0).own["constraint law"].gain[0] == pytest.approx(low, rel=1e-6)
+
+
+def test_every_source_of_random_numbers_has_a_seed_in_the_search():
+    """Noise, gusts, links and the sensing of obstacles are flown with several seeds where they act, and only there."""
+    assert _seed_paths(PAIR) == ["disturbances.noise.seed"]
+    document = rf.load_mission("moving-obstacles").to_dict()
+    document["avoidance"]["sensing_noise"] = 0.0
+    assert "avoidance.seed" not in _seed_paths(rf.Mission.from_dict(document))
+    document["avoidance"]["sensing_noise"] = 0.05
+    assert "avoidance.seed" in _seed_paths(rf.Mission.from_dict(document))
+
+
 @pytest.mark.parametrize(
     ("text", "kept"),
     [
@@ -176,6 +197,7 @@ def test_margins_are_those_of_check():
         (TEXT.replace("[constraint]", "[ constraint ]"), True),
         (TEXT + "\n[tracking]\nQ = [4.0,  # stiff\n  4.0]\nR = 1.0\n", False),
         (TEXT.replace("alpha = 3.0 ", "beta = 2 "), True),
+        (TEXT.replace("alpha = 3.0 ", "cutoff = 1e-3\nalpha = 3.0 "), True),
         ("constraint = {alpha = 2.0}\n" + WITHOUT, False),
         ("constraint.alpha = 2.0\n" + WITHOUT, False),
     ],

@@ -15,6 +15,8 @@ def to_whole_number(_type: Any, tokens: Sequence[Any]) -> int:
     return parse_whole(tokens[0].value)
 
 
+#: A whole number.
+Whole = Annotated[int, Parameter(converter=to_whole_number)]
 #: A number of processes.
 Workers = Annotated[
     int | None, Parameter(converter=to_whole_number, validator=validators.Number(gte=1))

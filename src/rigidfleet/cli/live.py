@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import MissionName, to_whole_number
+from rigidfleet.cli.arguments import MissionName, Whole
 from rigidfleet.cli.outputs import Files
 
 if TYPE_CHECKING:
     from rigidfleet.result import Result
 from rigidfleet.cli.codes import PASSED
-from rigidfleet.cli.run import raise_interrupts
 
 
 def live(
@@ -22,7 +19,7 @@ def live(
     /,
     *,
     out: Path | None = None,
-    port: Annotated[int, Parameter(converter=to_whole_number)] = 0,
+    port: Whole = 0,
     no_browser: bool = False,
 ) -> int:
     """Fly the vehicles of a mission by hand in the browser, in real time. Each flight is saved when it ends.
@@ -60,6 +57,5 @@ def live(
         console.out().print(f"Flying {flown.name} at {url}", soft_wrap=True)
         console.err().print("To end the flight, press Ctrl-C or close its page")
 
-    with raise_interrupts():
-        fly(flown, port=port, browser=not no_browser, ready=announce_url, landed=save_flight)
+    fly(flown, port=port, browser=not no_browser, ready=announce_url, landed=save_flight)
     return PASSED

@@ -202,7 +202,7 @@ def _sweep_and_folder(
 ) -> tuple[Sweep, Path]:  # fmt: skip
     """Sweep of the command line, and its folder; ``of_others``: limits and reading of others' trajectories."""
     from rigidfleet.mission import mission_names
-    from rigidfleet.sweep import Sweep, shards, store
+    from rigidfleet.sweep import Sweep, faults, shards, store
     from rigidfleet.sweep.definition import is_sweep_file
 
     here = Path(what)
@@ -236,8 +236,10 @@ def _sweep_and_folder(
         definition = Sweep.of(mission, vary, runs=runs, origin="rigidfleet sweep", **keys)
     elif not named and is_sweep_file(what):
         definition = Sweep.load(what, more=vary, runs=runs, **keys)
-        for file, note in definition.drill.notes_on_files() if definition.drill else ():
-            console.warn(f"{file}: {note}.")
+        drill = definition.drill
+        if drill and (drill.files or drill.stale):  # read once: processes that fly are forks
+            for note in faults.show_of(definition.mission.text, drill).notes:
+                console.warn(note)
     else:
         definition = Sweep.of(what, vary, runs=runs, origin="rigidfleet sweep", **keys)
     return definition, out or Path("sweeps", definition.name)

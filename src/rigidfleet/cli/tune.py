@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from cyclopts import Parameter
+from typing import Any, Literal
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import MissionName, Workers, to_whole_number
+from rigidfleet.cli.arguments import MissionName, Whole, Workers
 from rigidfleet.cli.codes import INTERRUPTED, PASSED
 from rigidfleet.cli.run import show_progress
 from rigidfleet.errors import RigidfleetError
@@ -20,10 +18,10 @@ def tune(
     /,
     *,
     objective: Literal["shape", "shape-rms", "shape-forces", "tracking", "tracking-rms"] = "shape",
-    budget: Annotated[int, Parameter(converter=to_whole_number)] = 300,
-    seeds: Annotated[int, Parameter(converter=to_whole_number)] = 3,
-    validation: Annotated[int, Parameter(converter=to_whole_number)] = 8,
-    seed: Annotated[int, Parameter(converter=to_whole_number)] = 0,
+    budget: Whole = 300,
+    seeds: Whole = 3,
+    validation: Whole = 8,
+    seed: Whole = 0,
     margin_share: float = 1.0,
     assume: list[str] | None = None,
     workers: Workers = None,

@@ -105,14 +105,9 @@ class SweepColumn:
         return keypaths.path_of_keys(self.keys)
 
     @property
-    def has_non_numbers(self) -> bool:
-        """Whether some of its values are no numbers."""
-        return not all(map(is_number, getattr(self.variation, "values", ())))
-
-    @property
     def has_order(self) -> bool:
         """Whether its values have an order; those of seeds have none."""
-        return not self.has_non_numbers and self.keys[-1] != "seed"
+        return self.variation.is_numeric and self.keys[-1] != "seed"
 
 
 @with_earlier_members(document="mission_document", varied="document_of_run")
@@ -549,9 +544,7 @@ class _SweepDraft:
             return
         if v is None:
             return
-        values = getattr(v, "values", ())
-        numeric = all(map(is_number, values))
-        for word in values:
+        for word in getattr(v, "values", ()):
             if remedy := next(filter(None, (rename_hint(keys[-1], word) for keys in places)), ""):
                 self.add(("vary", k, "values"), "is no value of the mission format", remedy, word)
         for keys in places:
@@ -565,10 +558,10 @@ class _SweepDraft:
             elif absent and v.change != "set":
                 problem = f"the mission has no value to {v.change} to"
                 remedy = "set the value by =, or write one in the mission"
-            elif numeric and words and not absent:
+            elif v.is_numeric and words and not absent:
                 problem = f"has the value {words[0]!r}, which is not a number"
                 remedy = f"vary it by a choice or grid of words, as grid({json.dumps(words[0])})"
-            elif starts and not (numeric and keys[:2] in _STARTS):
+            elif starts and not (v.is_numeric and keys[:2] in _STARTS):
                 problem = "with final states alone, only numbers in agents.position and agents.velocity can vary"
                 remedy = f"remove it, or {_WHOLE}"
             else:

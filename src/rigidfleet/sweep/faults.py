@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -97,26 +97,6 @@ class Drill(Part):
         named = [*map(Path, self.files + self.stale)]
         paths = sorted(p for path in named for p in (path, *path.rglob("*")) if p.is_file())
         return hashlib.sha256(b"".join(p.read_bytes() for p in paths)).hexdigest() if paths else ""
-
-    @property
-    def reading(self) -> dict[str, Any]:
-        """How its files are read: options of `foreign.files.read_trajectories`."""
-        return {name: getattr(self, name) for name in READING}
-
-    def notes_on_files(self) -> Iterator[tuple[str, str]]:
-        """The notes on the files that it names, each with the first of those that are read together.
-
-        Raises
-        ------
-        TrajectoryError
-            They cannot be read.
-        """
-        from rigidfleet.foreign.files import read_trajectories
-
-        versions = [(name,) for name in self.stale if not names_mission(name)]
-        for files in filter(None, (self.files, *versions)):
-            for note in read_trajectories(files, spans="stand", **self.reading).notes:
-                yield files[0], note
 
     def with_files_in_folder(self, folder: Path) -> Drill:
         """The same, with files as seen from a folder; names of shipped missions stay."""
@@ -226,6 +206,7 @@ class Show:
     curve : ways (K, N, 4, P) of x, y, z [m] and yaw [rad]
     how : what these are, in words
     mission : whose radii, limits, fences and obstacles count
+    notes : on files, each behind the first of those that are read together
 
     Raises
     ------
@@ -238,13 +219,12 @@ class Show:
 
         self.mission, self.drill, self.n = mission, drill, mission.n_agents
         self.names: tuple[str, ...] = ()
+        self.notes: list[str] = []
         self._origin = getattr(mission.geodetic_origin, "geodetic", None)
         self.curve, self.how, verdict, self.names = self._fly_or_read_ways(mission, drill.files)
         if not verdict.passed:
-            why = next(check.message for check in verdict.checks if not check.passed)
-            raise RigidfleetError(
-                f"drill: the flight fails without any fault: {why}. Mend this first."
-            )
+            why = f"the flight fails without any fault: {verdict.failures[0].message}"
+            raise RigidfleetError(f"drill: {why}. Mend this first.")
         data = judging_mission(self.curve.pieces[0, :, :3, 0], 1.0, mission=mission).to_dict()
         motions = {q.name for q in MOTIONS}  # which a fault leaves as they are
         data["limits"] = {k: x for k, x in data.get("limits", {}).items() if k not in motions}
@@ -280,9 +260,9 @@ class Show:
         from rigidfleet.simulation.trajectories import CURVE_NAMES, result_of_trajectories
 
         if files:
-            read = read_trajectories(
-                files, spans="stand", origin=self._origin, **self.drill.reading
-            )
+            how: dict[str, Any] = {name: getattr(self.drill, name) for name in READING}
+            read = read_trajectories(files, spans="stand", origin=self._origin, **how)
+            self.notes += [f"{files[0]}: {note}." for note in read.notes]
             self._origin = self._origin or read.read[0].get("origin")
             if len(read.curves) != self.n:
                 raise RigidfleetError(
@@ -318,7 +298,7 @@ class Show:
             return {}, "", ""
         result, every = self.flight_of_vehicles_near_fault(fault)
         verdict = assess(result)
-        failed = [check for check in verdict.checks if not check.passed]
+        failed = verdict.failures
         worst = {c.check: c.worst for c in verdict.checks if c.judged and c.check in METRICS}
         named = {k: x for k, x in enumerate(self.names) if x.removeprefix("agent ") != f"{k + 1}"}
         who = [f"{k + 1} ({named[k]})" if k in named else f"{k + 1}" for k in every.tolist()]

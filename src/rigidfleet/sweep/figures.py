@@ -188,7 +188,7 @@ def _draw_worst_run(ax: Axes, table: Table, case: Borne) -> None:
     """Draw the worst run of a fault: vehicles when it fails, those concerned with their ways until then."""
     assert case.worst is not None
     result, every = flight_with_fault(table.sweep, case.worst.run)
-    failure = next(check for check in assess(result).checks if not check.passed)
+    failure = assess(result).failures[0]
     end = result.time[-1] if failure.when is None else failure.when
     now = int(np.searchsorted(result.time, end - 1e-9).clip(0, len(result.time) - 1))
     since = int(np.searchsorted(result.time, end - _WAY))

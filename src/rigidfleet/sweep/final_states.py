@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,8 +18,6 @@ from rigidfleet.mission import Mission, bounds
 from rigidfleet.mission.formations import coincident_pairs
 from rigidfleet.mission.kinds import seconds
 from rigidfleet.simulation.ensemble import Ensemble, establish, max_edge_error
-from rigidfleet.sweep.metrics import METRICS
-from rigidfleet.sweep.record import RunRecord, reason_and_detail
 from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
@@ -36,35 +33,30 @@ _WORDS = {
 }
 
 
-def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
-    """Fly complete groups of runs and evaluate the final states of their phases.
+def final_state_outcomes(
+    sweep: Sweep, runs: Sequence[int], values: Sequence[Sequence[Any]]
+) -> list[tuple[dict[str, float], str, str] | MissionError]:
+    """Fly complete groups of runs by their values (B, D); metrics of each, the checks that it fails, and words.
 
     A run passes if it is flown to its end and reaches each formation: the checks "distances", "shape" and
     "handedness" are those of `rigidfleet.assess`. The metrics are those of the shape, and the number of evaluations,
-    which the eight runs of a vector share.
+    which the eight runs of a vector share. Instead of an invalid mission, that of the sweep is flown: such a run has
+    its errors.
     """
-    begun = perf_counter()
-    values = [sweep.values(run) for run in runs]
     r, v = start_states(sweep, values)
     refused = _runs_of_invalid_missions(sweep, runs, r, v)
-    out = list(refused)
+    out = [*refused]
     r[out], v[out] = sweep.mission.agents.position, sweep.mission.agents.velocity
     ensemble = establish(sweep.mission, r, v)
     wrong, metrics = _failures_and_metrics(sweep.mission, ensemble)
     failed = {"complete": ~ensemble.finished} | {k: ensemble.finished & x for k, x in wrong.items()}
-    wall = (perf_counter() - begun) / len(runs)
-    rows = []
-    for k, (run, drawn) in enumerate(zip(runs, values, strict=True)):
-        codes = tuple(c.variation.encode(x) for c, x in zip(sweep.columns, drawn, strict=True))
-        if k in refused:
-            unknown = dict.fromkeys(METRICS, math.nan)
-            rows.append(RunRecord(run, False, *refused[k], codes, unknown, wall))
-            continue
+    outcomes = []
+    for k in range(len(runs)):
         reasons = [name for name, which in failed.items() if which[k]]
+        known = {name: float(x[k]) for name, x in metrics.items()}
         detail = _WORDS[reasons[0]] if reasons else ""
-        known = {name: float(metrics[name][k]) if name in metrics else math.nan for name in METRICS}
-        rows.append(RunRecord(run, not reasons, ", ".join(reasons), detail, codes, known, wall))
-    return rows
+        outcomes.append(refused.get(k) or (known, ", ".join(reasons), detail))
+    return outcomes
 
 
 def start_states(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats, Floats]:
@@ -83,8 +75,8 @@ def start_states(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats,
 
 def _runs_of_invalid_missions(
     sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats
-) -> dict[int, tuple[str, str]]:
-    """Reason and detail of runs with an invalid mission, by index. Only doubtful missions are checked in full."""
+) -> dict[int, MissionError]:
+    """Errors of runs with an invalid mission, by index. Only doubtful missions are checked in full."""
     bounded = np.all((abs(r) <= bounds.LENGTH.most) & (abs(v) <= bounds.SPEED.most), axis=(1, 2))
     r, v = (np.where(bounded[:, None, None], x, 0.0) for x in (r, v))
     apart = [not any(coincident_pairs(points)) for points in r.tolist()]
@@ -93,7 +85,7 @@ def _runs_of_invalid_missions(
         try:
             sweep.mission_of(runs[k])
         except MissionError as error:
-            refusals[int(k)] = reason_and_detail(error)
+            refusals[int(k)] = error
     return refusals
 
 

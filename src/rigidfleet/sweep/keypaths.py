@@ -10,6 +10,7 @@ import copy
 import difflib
 import re
 from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
 from typing import Any, get_args
 
 from pydantic.fields import FieldInfo
@@ -24,8 +25,6 @@ from rigidfleet.sweep.variation import NotationError
 ANY = "*"
 _STEP = re.compile(r'"([^"]*)"|\[(\d+|\*)\]|([^.\[\]"]+)')
 _PATH = re.compile(r'(\.?("[^"]*"|[^.\[\]"]+)|\.?\[(\d+|\*)\])+')
-#: Digits of the largest index: no list is longer.
-_DIGITS = 9
 #: Types of keys that take one number or a list, and the length of the list; 0: the number of agents.
 _LISTS = ((get_args(PerAgentError)[0], 0), (PerAgent | None, 0), (PerAxis | None, 3))
 
@@ -68,16 +67,13 @@ def replace_value(
 ) -> None:
     """Replace a value in a document by a function of it, in place. A missing value is taken from ``whole``."""
     at: Any = document
-    for depth, (k, following) in enumerate(zip(keys, (*keys[1:], None), strict=True), start=1):
-        if following is None:
-            there = k in at if isinstance(at, dict) else True
-            at[k] = by(at[k] if there else copy.deepcopy(look_up(whole, keys)))
-            return
+    for depth, (k, following) in enumerate(pairwise(keys), start=1):
         table = isinstance(following, str)
         if not isinstance(look_up(at, (k,)), dict if table else list):
             # A table may lack keys; a list needs all its entries.
             at[k] = {} if table else copy.deepcopy(look_up(whole, keys[:depth]))
         at = at[k]
+    at[keys[-1]] = by(look_up(at, keys[-1:], look_up(whole, keys)))
 
 
 def is_in_absent_table(whole: Mapping[str, Any], keys: Keys) -> bool:
@@ -148,14 +144,13 @@ def _best_matches(whole: Mapping[str, Any], steps: list[str]) -> tuple[list[tupl
 
 
 def _children(at: Any, step: str) -> Iterator[tuple[str | int, Any]]:
-    if isinstance(at, dict) and step == ANY:
-        yield from ((k, inner) for k, inner in at.items() if not isinstance(inner, Absent))
-    elif isinstance(at, dict):
-        yield from [(step, at[step])] if step in at else []
-    elif isinstance(at, list) and step == ANY:
-        yield from enumerate(at)
-    elif isinstance(at, list) and step.isdecimal() and len(step) <= _DIGITS:
-        yield from [*enumerate(at)][int(step) - 1 : int(step)] if int(step) else []
+    """Keys and values of a table or a list that a step leads to; of a list with their indices from 1 as names."""
+    for name, inner in at.items() if isinstance(at, dict) else ():
+        if step == name or (step == ANY and not isinstance(inner, Absent)):
+            yield name, inner
+    for k, inner in enumerate(at) if isinstance(at, list) else ():
+        if step in (ANY, f"{k + 1}"):
+            yield k, inner
 
 
 def _path_remedy(whole: Mapping[str, Any], at: Any, steps: list[str], depth: int) -> str:

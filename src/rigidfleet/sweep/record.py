@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from rigidfleet.errors import MissionError
 from rigidfleet.kernel.compiler import levels
 
 #: Reasons other than failed checks, of runs without a verdict: the varied mission has errors; the program failed; the
@@ -37,13 +36,6 @@ class RunRecord:
     metrics: dict[str, float]
     wall: float
     level: str = field(default_factory=levels.target_instruction_level)
-
-
-def reason_and_detail(error: MissionError) -> tuple[str, str]:
-    """Reason and detail of a run whose mission has errors."""
-    first = error.findings[0]
-    words = f"{first.key} = {first.value!r}: {first.problem}"
-    return REFUSED, " ".join(words.split())
 
 
 def reason_in_words(reason: str) -> str:

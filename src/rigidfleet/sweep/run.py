@@ -15,7 +15,7 @@ from rigidfleet.mission import Mission
 from rigidfleet.sweep import faults
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS, measure_metrics
-from rigidfleet.sweep.record import BROKEN, RAISED, RunRecord, reason_and_detail
+from rigidfleet.sweep.record import BROKEN, RAISED, REFUSED, RunRecord
 from rigidfleet.typing import Ints
 
 if TYPE_CHECKING:
@@ -47,9 +47,15 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
         This machine cannot fly them, or the show of a drill cannot be drilled.
     """
     if sweep.evaluate == "final":
-        from rigidfleet.sweep.final_states import fly_final_states
+        from rigidfleet.sweep.final_states import final_state_outcomes
 
-        return fly_final_states(sweep, runs)
+        begun, values = perf_counter(), [sweep.values(run) for run in runs]
+        outcomes = final_state_outcomes(sweep, runs, values)
+        shared = (perf_counter() - begun) / len(runs)
+        return [
+            _run_row(sweep, *each, perf_counter() - shared)
+            for each in zip(runs, values, outcomes, strict=True)
+        ]
     rows: list[RunRecord] = []
     groups: dict[int, list[int]] = {}
     for run in runs:
@@ -148,7 +154,8 @@ def _run_row(sweep: Sweep, run: int, values: Sequence[Any], flown: Any, begun: f
     outcome = flown if done else _value_or_error(lambda: _metrics_and_failure(flown))
     match outcome:
         case MissionError():
-            reason, detail = reason_and_detail(outcome)
+            first = outcome.findings[0]
+            reason, detail = REFUSED, f"{first.key} = {first.value!r}: {first.problem}"
         case FlightError() if sweep.header.law_key_and_name[1]:
             reason, detail = RAISED, str(outcome)
         case Exception():
@@ -165,6 +172,6 @@ def _metrics_and_failure(result: Result) -> tuple[dict[str, float], str, str]:
     from rigidfleet.assessment import assess
 
     verdict = assess(result)
-    failed = [f for f in verdict.checks if not f.passed]
+    failed = verdict.failures
     reason = ", ".join(dict.fromkeys(f.check for f in failed))
     return measure_metrics(result, verdict), reason, failed[0].message if failed else ""

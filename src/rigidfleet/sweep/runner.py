@@ -66,6 +66,7 @@ class SweepProgress:
 
 
 _Listener = Callable[[SweepProgress], None] | None
+_Job = Callable[[str, str, list[int]], list[RunRecord]]
 
 
 def fly(
@@ -121,9 +122,9 @@ def fly(
         flight = _Sweeping(sweep, store, progress, own)
         if cluster is not None:
             with pools.open_cluster(cluster) as (executor, capacity):
-                flight.fly_by_executor(executor, capacity)
+                flight.fly_by_executor(executor, capacity, pools.fly_chunk_in_cluster)
         elif pool is not None:
-            flight.fly_by_executor(pool, lambda: count)
+            flight.fly_by_executor(pool, lambda: count, pools.fly_chunk)
         else:
             flight.fly_in_this_process(until_worth=count > 1)
             deaths = 0
@@ -132,7 +133,7 @@ def fly(
                 flight.report_progress(count)
                 try:
                     with pools.start_processes(count) as executor:
-                        flight.fly_by_executor(executor, lambda: count)
+                        flight.fly_by_executor(executor, lambda: count, pools.fly_chunk)
                 except RigidfleetError as error:
                     deaths = 1 if flight.flown > before else deaths + 1
                     if deaths >= _DEATHS or not isinstance(error.__cause__, BrokenExecutor):
@@ -176,7 +177,7 @@ class _Sweeping:
             self.store_records(rows)
             self.report_progress(1)
 
-    def fly_by_executor(self, executor: Executor, capacity: Callable[[], int]) -> None:
+    def fly_by_executor(self, executor: Executor, capacity: Callable[[], int], job: _Job) -> None:
         """Fly all missing runs by an executor with a number of workers. Runs that do not come back are missing again.
 
         Raises
@@ -190,7 +191,8 @@ class _Sweeping:
                 return call(*arguments)
             except Exception as error:
                 who = "the executor takes no work" if call == executor.submit else "a worker failed"
-                raise self.failure(pools.why_failed(error, who)) from error
+                in_cluster = job is pools.fly_chunk_in_cluster
+                raise self.failure(pools.why_failed(error, who, in_cluster=in_cluster)) from error
 
         flying: dict[Future[list[RunRecord]], list[int]] = {}
         taken: list[int] = []
@@ -200,7 +202,7 @@ class _Sweeping:
                 workers = call_or_fail(capacity)
                 while self.missing and len(flying) < _AHEAD * max(1, workers):
                     taken = self.take_chunk(max(1, workers))
-                    flying[call_or_fail(executor.submit, pools.fly_chunk, *sweep, taken)] = taken
+                    flying[call_or_fail(executor.submit, job, *sweep, taken)] = taken
                     taken = []
                 for future in wait(flying, _LOOK, FIRST_COMPLETED).done:
                     self.store_records(call_or_fail(future.result))

@@ -50,11 +50,6 @@ def shard_folder(folder: Path, shard: str) -> Path:
     return folder / _SHARDS / shard.replace("/", "-of-") if shard else folder
 
 
-def shard_folders(folder: Path) -> list[Path]:
-    """Folders of the shards that are in the folder of a sweep."""
-    return sorted(path for path in folder.glob(f"{_SHARDS}/*") if is_store(path))
-
-
 def readable_sweeps(folder: Path) -> Iterator[Sweep]:
     """The sweeps of the shards in a folder of a sweep; those that cannot be read are left out."""
     for path in sorted(folder.glob(f"{_SHARDS}/*")):
@@ -78,7 +73,7 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
         contains another sweep or cannot be written. Nothing is written then.
     """
     folder = Path(folder)
-    paths = shard_folders(folder) or [folder / _SHARDS]
+    paths = sorted(filter(is_store, folder.glob(f"{_SHARDS}/*"))) or [folder / _SHARDS]
     stored = [store_contents(path) for path in paths]
     (_, common, _), sweep = stored[0], max((own for own, *_ in stored), key=lambda x: x.runs)
     rows: dict[int, tuple[Path, tuple[Any, ...]]] = {}

@@ -19,7 +19,7 @@ from rigidfleet._common.quantities import display_unit
 from rigidfleet.sweep import store
 from rigidfleet.sweep.faults import FAULTS
 from rigidfleet.sweep.metrics import METRICS, readable_unit
-from rigidfleet.sweep.record import reason_in_words
+from rigidfleet.sweep.record import BROKEN, reason_in_words
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Percentiles of metrics.
@@ -159,6 +159,9 @@ class Summary(Shown):
         ]
         if self.drill:
             parts = [*self._case_tables(), self._reason_table()]
+        if BROKEN in self.reasons:
+            words = "Rows of program errors stay. Where the machine was to blame, as without memory, --force flies all."
+            parts.append(Line(words, "note"))
         if n:
             words = f"{len(strong)} of {n} pairs tested correlate (false discovery rate {100 * _CHANCE:g} %)."
             parts.append(Line(words))
@@ -242,7 +245,7 @@ def summarise(table: store.Table) -> Summary:
             percentiles[name] = np.percentile(finite, PERCENTILES).tolist()
     by_value = {}
     for k, column in enumerate(table.sweep.columns):
-        if column.has_non_numbers:
+        if not column.variation.is_numeric:
             words = np.array([str(column.variation.decode(x)) for x in table.codes[:, k].tolist()])
             by_value[column.name] = {
                 word: pass_rate(table.passed[words == word])

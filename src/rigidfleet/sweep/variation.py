@@ -54,6 +54,11 @@ class Variation(Part):
         """Values that are taken in turn; none of a distribution."""
         return ()
 
+    @property
+    def is_numeric(self) -> bool:
+        """Whether all its values are numbers."""
+        return True
+
     def changed_value(self, there: Any, value: Any) -> Any:
         """What is in the place of a number, or of an array, for a value of the variation."""
         return _CHANGES[self.change](there, value)
@@ -141,24 +146,25 @@ class _Listed(Variation):
 
     def encode(self, value: Any) -> float:
         """Encode a value: itself if all values are numbers, else its index."""
-        return float(value) if self._is_numeric else float(self.values.index(value))
+        return float(value if self.is_numeric else self.values.index(value))
 
     def decode(self, code: float) -> Any:
         """Decode a value."""
-        return code if self._is_numeric else self.values[int(code)]
+        return code if self.is_numeric else self.values[int(code)]
 
     def key_problem_and_remedy(self) -> tuple[str, str, str] | None:
         """Error if a value is of another type, or if values that are not numbers are to be added or scaled."""
         if not all(map(_is_usable_value, self.values)):
             words = "finite numbers, words, true or false, or lists of these"
             return "values", f"must be {words}", "correct the value"
-        if self.change != "set" and not self._is_numeric:
+        if self.change != "set" and not self.is_numeric:
             problem = f"must be numbers to {self.change}"
             return "values", problem, "give numbers or use change = 'set'"
         return None
 
     @cached_property
-    def _is_numeric(self) -> bool:
+    def is_numeric(self) -> bool:
+        """Whether all its values are numbers."""
         return all(map(is_number, self.values))
 
 

@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -23,6 +24,10 @@ from rigidfleet.sweep.run import fly_runs
 
 #: Maximum time to wait for a scheduler [s].
 _CONNECT = 20.0
+#: Number of workers of a cluster that try to fly a chunk.
+_TRIES = 5
+#: Time between looks whether one that was passed on is flown [s].
+_LOOK = 0.1
 
 
 def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
@@ -41,12 +46,47 @@ def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
     return fly_runs(flown, runs)
 
 
+def fly_chunk_in_cluster(
+    sweep: str, version: str, runs: Sequence[int], tried: tuple[str, ...] = ()
+) -> list[RunRecord]:
+    """Fly a chunk on a worker of Dask. One that cannot passes it on to others, until ``tried`` are `_TRIES` addresses.
+
+    Raises
+    ------
+    RigidfleetError
+        None of them can, for the reason of the last one.
+    """
+    from distributed import get_worker, worker_client
+
+    try:
+        return fly_chunk(sweep, version, runs)
+    except RigidfleetError:
+        tried = (*tried, get_worker().address)
+        if len(tried) == _TRIES:
+            raise
+        with worker_client() as client:
+            if not (others := [x for x in client.nthreads() if x not in tried]):
+                raise
+            chunk = sweep, version, runs, tried
+            future = client.submit(fly_chunk_in_cluster, *chunk, workers=others, pure=False)
+            while not future.done():
+                if client.nthreads().keys().isdisjoint(others):  # it would wait for them for ever
+                    raise
+                time.sleep(_LOOK)
+            return future.result()
+
+
 @contextmanager
 def start_processes(count: int) -> Generator[Executor]:
     """Start persistent processes on this machine. They end with this process, even if it is killed.
 
     They are forks of this process where that is safe, as they then begin with all that it has loaded. Elsewhere, each
     starts on its own.
+
+    Raises
+    ------
+    RigidfleetError
+        The machine allows no further process.
     """
     before = set(multiprocessing.active_children())
     forked = _is_fork_safe()
@@ -60,6 +100,11 @@ def start_processes(count: int) -> Generator[Executor]:
                 before_fork = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
                 try:
                     pool.submit(int)
+                except OSError as error:
+                    words = "Use fewer --workers, or --workers 1"
+                    raise RigidfleetError(
+                        f"no process can be started: {error}. {words}."
+                    ) from error
                 finally:
                     signal.pthread_sigmask(signal.SIG_SETMASK, before_fork)
             yield pool
@@ -131,9 +176,9 @@ def open_cluster(address: str) -> Generator[tuple[Executor, Callable[[], int]]]:
         log.setLevel(before)
 
 
-def why_failed(error: Exception, who: str) -> str:
+def why_failed(error: Exception, who: str, *, in_cluster: bool = False) -> str:
     """Why work that was handed to an executor did not come back, and what to do; ``who`` failed, if nobody died."""
-    if isinstance(error, CancelledError | OSError):
+    if in_cluster and isinstance(error, CancelledError | OSError):
         return "the scheduler of the cluster ended, or the connection to it."
     if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # Dask's
         return "workers died. If memory is short, use fewer of them; a script needs `if __name__ == '__main__':`."

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from rigidfleet._common.toml import to_toml, toml_equals_data
 from rigidfleet.math import lqr, pid
-from rigidfleet.math.margins import Loop, LoopGains, Margins, stability_margins
+from rigidfleet.math.margins import Margins, stability_margins
 from rigidfleet.mission import Mission
 from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.schema import Tracking
@@ -22,6 +20,7 @@ from rigidfleet.planning.preview import preview_phases
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.planning.vehicles import lags_by_vehicle
 from rigidfleet.preflight.margins import ClosedLoops, loops_and_omission, tracking_closed_loops
+from rigidfleet.sweep.keypaths import replace_value
 from rigidfleet.typing import Floats
 
 #: A gain by its path in the mission, as in a variation.
@@ -43,8 +42,10 @@ _HALF = 0.5
 _TRIES = 30
 #: Relative size of rounding errors of margins.
 _ROUNDING = 1e-9
-#: Names of the two laws, as `check` has them.
-_TRACKING, _CONSTRAINT = "tracking", "constraint law"
+#: Table of the gains of the constraint law.
+_LAW = "constraint."
+#: Name of the law of all shapes together; that of the tracking is "tracking", as `check` has it.
+_CONSTRAINT = "constraint law"
 
 
 def own_gains(mission: Mission) -> Gains:
@@ -87,16 +88,6 @@ def _to_four_digits(gain: float) -> float:
     return float(f"{gain:.4g}")
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A distinct part of a loop, whichever shapes have it."""
-
-    name: str
-    loop: Loop
-    law: LoopGains
-    growth: float
-
-
 class Screen:
     """Margins of the laws of a mission with other gains, to refuse gains before they fly.
 
@@ -110,12 +101,11 @@ class Screen:
         self.mission, self.share = mission, share
         self.gains = own_gains(mission)
         lags = lags_by_vehicle(mission)
-        laws: list[tuple[str, ClosedLoops]] = []
+        laws: list[ClosedLoops] = []
         if lags:
             tracking = tracking_closed_loops(mission, lags)
-            laws += [] if tracking is None else [(_TRACKING, tracking)]
             looped, _ = loops_and_omission(mission, preview_phases(mission)[0], lags)
-            laws += [(_CONSTRAINT, law) for law in looped]
+            laws = [*filter(None, [tracking]), *(x._replace(where=_CONSTRAINT) for x in looped)]
         self.parts = _distinct_loop_parts(laws)
         self.own = self.margins_by_law(self.gains)
 
@@ -142,28 +132,25 @@ class Screen:
 
     def _margins_of_parts(self, gains: Gains) -> Iterator[tuple[str, Margins]]:
         """Margins of all parts, with the name of the law of each."""
-        combined = self.gains | gains
-        Q = [combined.get(f"tracking.Q.{k}", self.mission.tracking.Q[k - 1]) for k in (1, 2)]
-        k1, k2 = lqr.double_integrator_gains(Q, self.mission.tracking.R)
-        new: dict[str, Any] = {"k1": k1, "k2": k2, "ki": combined.get("tracking.integral", 0.0)}
-        if "constraint.alpha" in self.gains:
-            new |= {
-                key: combined.get(f"constraint.{key}", 0.0) for key in ("alpha", "beta", "gamma")
-            }
-        for part in self.parts:
-            yield part.name, stability_margins([part.loop], replace(part.law, **new), part.growth)
+        t = self.mission.tracking
+        Q = [gains.get(f"tracking.Q.{k}", own) for k, own in enumerate(t.Q, start=1)]
+        k1, k2 = lqr.double_integrator_gains(Q, t.R)
+        new = {"k1": k1, "k2": k2, "ki": gains.get("tracking.integral", t.integral)}
+        new |= {k.removeprefix(_LAW): x for k, x in gains.items() if k.startswith(_LAW)}
+        for law, loops, own, growth in self.parts:
+            yield law, stability_margins(loops, replace(own, **new), growth)
 
 
-def _distinct_loop_parts(laws: Sequence[tuple[str, ClosedLoops]]) -> list[_Part]:
+def _distinct_loop_parts(laws: Sequence[ClosedLoops]) -> list[ClosedLoops]:
     """The distinct parts of all loops: most shapes have the same, and what decays on the longest way counts."""
-    parts: dict[object, _Part] = {}
-    for name, looped in laws:
+    parts: dict[object, ClosedLoops] = {}
+    for looped in laws:
         for loop in looped.loops:
             rounded = ((np.round(x, 9) + 0.0).tobytes() for x in (loop.S, loop.Q, loop.P))
-            key = (name, *rounded, loop.channels, looped.law)
+            key = (looped.where, *rounded, loop.channels, looped.law)
             if key not in parts or looped.growth < parts[key].growth:
-                parts[key] = _Part(name, loop, looped.law, looped.growth)
-    return sorted(parts.values(), key=lambda part: part.loop.S.size)  # the quick ones first
+                parts[key] = looped._replace(loops=[loop])
+    return sorted(parts.values(), key=lambda part: part.loops[0].S.size)  # the quick ones first
 
 
 def _margin_ratio(now: Margins, was: Margins) -> float:
@@ -201,41 +188,21 @@ def feasible_points(
 
 def with_gains(text: str, gains: Gains) -> str:
     """The text of a mission with other gains; the rest, comments included, stays where the text allows it."""
-    document = tomllib.loads(text)
-    wanted = copy.deepcopy(document)
-    new = text
-    for table, key, value in _gain_entries(document, gains):
-        wanted.setdefault(table, {})[key] = value
-        new = _replace_line(new, table, key, to_toml({key: value}).strip())
+    wanted, new = tomllib.loads(text), text
+    whole = {"tracking": {"Q": [*Tracking.model_fields["Q"].get_default()]}}
+    for path, gain in gains.items():
+        table, key, *place = path.split(".")
+        keys = (table, key, *(int(k) - 1 for k in place))
+        replace_value(wanted, whole, keys, lambda _, gain=gain: gain)
+        new = _replace_line(new, table, key, to_toml({key: wanted[table][key]}).strip())
     return new if toml_equals_data(new, wanted) else digest_lines(text) + to_toml(wanted)
 
 
-def _gain_entries(document: dict[str, Any], gains: Gains) -> Iterator[tuple[str, str, Any]]:
-    """Table, key and value of each entry; both weights of Q are one."""
-    Q = list(document.get("tracking", {}).get("Q", Tracking.model_fields["Q"].get_default()))
-    for path, gain in gains.items():
-        table, key, *place = path.split(".")
-        if not place:
-            yield table, key, gain
-            continue
-        Q[int(place[0]) - 1] = gain
-    if any(path.startswith("tracking.Q") for path in gains):
-        yield "tracking", "Q", [float(q) for q in Q]
-
-
 def _replace_line(text: str, table: str, key: str, line: str) -> str:
-    """The text with ``line`` in place of a key's, below the table's header, or in a new table at the end."""
-    lines = text.splitlines()
-    head = re.compile(rf"\s*\[\s*{table}\s*\]\s*(#.*)?")
-    at = next((k for k, x in enumerate(lines) if head.fullmatch(x)), None)
-    if at is None:
-        return "\n".join([*lines, "", f"[{table}]", line, ""])
-    last = at
-    for k in range(at + 1, len(lines)):
-        if lines[k].lstrip().startswith("["):
-            break
-        last = k if lines[k].strip() and not lines[k].lstrip().startswith("#") else last
-        if entry := re.fullmatch(rf"\s*{key}\s*=[^#]*?(\s*#.*)?", lines[k]):
-            lines[k] = line + (entry[1] or "")
-            return "\n".join([*lines, ""])
-    return "\n".join([*lines[: last + 1], line, *lines[last + 1 :], ""])
+    """The text with ``line`` in place of a key's, or below the table's header, or in a new table at the end."""
+    head = rf"(?m)(^[ \t]*\[\s*{table}\s*\].*\n)"
+    entry = rf"((?:(?!\s*\[).*\n)*?)[ \t]*{key}\s*=[^#\n]*?([ \t]*#.*)?$"
+    new, changed = re.subn(head + entry, lambda m: f"{m[1]}{m[2]}{line}{m[3] or ''}", text, count=1)
+    if not changed:
+        new, changed = re.subn(head, lambda m: f"{m[1]}{line}\n", text, count=1)
+    return new if changed else f"{text}\n[{table}]\n{line}\n"

@@ -172,14 +172,14 @@ def _merge_keys(document: dict[str, Any], assume: Mapping[str, Any]) -> dict[str
 
 
 def _seed_paths(mission: Mission) -> list[str]:
-    """Paths of the seeds of the random numbers that act on a mission's flight."""
-    d, net = mission.all_disturbances, mission.network
-    noise = d.noise
+    """Paths of the seeds of the random numbers that act on a mission's flight: noise, gusts, links and sensing."""
+    noise, gusts = mission.all_disturbances.noise, mission.all_disturbances.gusts
+    net, avoidance = mission.network, mission.avoidance
     acting = {
-        "disturbances.noise": noise is not None
-        and bool(noise.position or noise.velocity or noise.dropped),
-        "disturbances.gusts": d.gusts is not None,
-        "network": net is not None and bool(net.loss or net.jitter),
+        "disturbances.noise": noise and (noise.position or noise.velocity or noise.dropped),
+        "disturbances.gusts": gusts,
+        "network": net and (net.loss or net.jitter),
+        "avoidance": avoidance and avoidance.sensing_noise,
     }
     return [f"{name}.seed" for name, acts in acting.items() if acts]
 
