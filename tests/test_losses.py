@@ -11,6 +11,7 @@ import rigidfleet as rf
 from rigidfleet import assess, check, simulate
 from rigidfleet.errors import MissionError
 from rigidfleet.math import splines
+from rigidfleet.math.attitude import angle_between
 from rigidfleet.mission import Mission
 from rigidfleet.result import Result
 from rigidfleet.web.live.pilot import Pilot
@@ -384,6 +385,20 @@ def test_a_second_loss_does_not_begin_anew():
     result = simulate(mission(together))
     assert "after the loss of agents 2 and 4 at 8.00 s" in " ".join(assess(result).notes)
     assert assess(result).passed
+
+
+@pytest.mark.parametrize("second", [2, 3, 4])
+def test_two_that_are_left_show_the_attitude_that_they_are_led_in(second):
+    """Two vehicles are a line, whose attitude is the commanded one as far as they show it; it was one by chance."""
+    slots = [[0.5, -2.0, -1.5], [0.5, 2.0, -1.5], [-0.5, -2.0, 1.5], [-0.5, 2.0, 1.5]]
+    lost = [{"agent": 1, "time": 8.0}, {"agent": second, "time": 12.0}]
+    form = {"square": {"slots": slots}}
+    result = simulate(mission({"lost": lost, "on_loss": "hold"}, formations=form))
+    assert names(result)[-1] == "hold (loss)"
+    off = angle_between(result.attitude, result.attitude_reference)[result.time > 12.0]
+    assert len(off) > 10
+    assert np.degrees(off).max() < 1e-3
+    assert assess(result).by_name["waypoint_attitude"].passed
 
 
 def test_without_a_loss_nothing_changes():
