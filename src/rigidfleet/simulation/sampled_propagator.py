@@ -106,7 +106,6 @@ class SampledPropagator:
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
         if vehicles.avoidance is not None:
             vehicles.avoidance = avoidance.for_next_phase(vehicles.avoidance)
-        self.by_pieces = False  # whether the reference is given piece by piece
         self.steered = False  # whether it is given by hand
         self.decided_until = -math.inf  # end of what the leader has decided [s]
         self.flown: Problem | None = None  # the problem of the steps in the trail
@@ -127,7 +126,7 @@ class SampledPropagator:
         """Begin to fly at a state (n,) and time [s]; vehicles go on from the states that they have."""
         at, plan, fleet_state = self.integration, self.integration.plan, self.vehicles
         n, m = len(plan.masses), len(plan.edges)
-        at.begin(y, t, states=6 * n)
+        at.begin(y, t, 6 * n, records.VEHICLES_TRAIL)
         lost = self.flight.vehicles._replace(lost=plan.before.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
@@ -159,7 +158,7 @@ class SampledPropagator:
             self.gone = plan.before.lost.copy()  # (N,) vehicles that do not fly in this phase
             begun.peak_time[:] = begun.worst_time[:] = t
         self.tabled = None
-        self.steps_taken_over = int(begun.count[fleet.STEPS])  # those of the flight before
+        self.steps_before = int(begun.count[fleet.STEPS])  # those of the flight before
 
     # -- flying -----------------------------------------------------------------------------------
 
@@ -173,7 +172,6 @@ class SampledPropagator:
             self.decided_until = end
             if (problem := leader.lead(t, end, arrays)) is not None:
                 self._continue_with(problem)
-                self.by_pieces = leader.leads
         return self.decided_until
 
     @property
@@ -220,7 +218,6 @@ class SampledPropagator:
         if tables.yaw.kind == "along":
             now = tables.yaw_at(plan.problem, t, self.turn)
             self.turn = yaw_turn_from(problem, t, tables.yaw, now)
-        self.by_pieces = True
         plan.problem = problem
 
     def states_seen(self) -> dict[str, Floats]:
@@ -289,16 +286,13 @@ class SampledPropagator:
             if not -_FAR < points.min() <= points.max() < _FAR:  # NaN is not, either
                 rows = int((abs(points) < _FAR).all(axis=(1, 2)).argmin())
             at.state.count[records.TRAILED] = rows
-            extremes.monitor_paths(self.flown, at.workspace, at.state)
+            extremes.monitor_paths(self.flown, at.state)
             self.sampled.count[fleet.TRAILED] = at.state.count[records.TRAILED] = 0
             self.unjudged = True
         if last and self.unjudged:  # the rest is kept by the flight itself
             assert self.first_tick is not None  # it has begun
             ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
-            lost = at.plan.before.lost
-            extremes.take_vehicle_extremes(
-                self.sampled, self.flight.vehicles, self.gone, lost, ticks
-            )
+            extremes.take_vehicle_extremes(self.sampled, self.flight.vehicles, self.gone, ticks)
             self.unjudged = False
 
     def fly(self, problem: Problem, t_end: float) -> None:
@@ -374,8 +368,10 @@ class SampledPropagator:
             before = source.switch_path(planned, tick, tables, tau)
         # A piece of a reference that is led holds until the next stop
         until = plan.t_end
-        if self.by_pieces:
-            until = min(until, self.decided_until if not self.steered else self.integration.stop)
+        if self.steered:
+            until = min(until, self.integration.stop)
+        elif self.leader is not None and self.leader.now is not None:
+            until = min(until, self.decided_until)
         last = min(tick + _TICKS, math.ceil(until * source.rate) + 1)
         made = source.tables_for(tick, max(last, tick + 1), planned, self.turn, tau)
         if before is not None:  # states that were measured about another path
@@ -393,10 +389,9 @@ class SampledPropagator:
         if plan.frame is not None:
             y[6 * n + m : 6 * n + m + 4] = sampled.frame[0]
         state.clock[records.TIME] = sampled.clock[fleet.TIME]
-        steps = int(sampled.count[fleet.STEPS]) - self.steps_taken_over
-        state.count[records.EVALUATIONS] += 4 * steps
-        state.count[records.ACCEPTED] += steps
-        self.steps_taken_over += steps
+        steps = int(sampled.count[fleet.STEPS]) - self.steps_before
+        state.count[records.EVALUATIONS] = 4 * steps
+        state.count[records.ACCEPTED] = steps
 
     def hand_over(self) -> None:
         """Leave the vehicles' states to the next phase, and so the workspace, to which these may refer."""
