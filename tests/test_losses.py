@@ -579,6 +579,30 @@ def test_the_loss_of_a_link_is_answered(on_loss):
 # -- before the flight --------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("lost", [2, 3])
+@pytest.mark.parametrize("into", ["another", "a ball", "a fence", "air of another"])
+def test_a_lost_vehicle_is_where_others_would_lead_it_no_more(lost, into):
+    """The slot of agent 2 in the landing is where no vehicle may be: check and flight fail unless agent 2 is lost."""
+    slots = [[0.0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]]
+    slots[1] = {"another": [0.3, 0, 0], "air of another": [0.4, 0, 0]}.get(into, [8, 0, 0])
+    tables: dict[str, Any] = {}
+    if into == "a ball":
+        ball = {"kind": "sphere", "centre": [21.9, 7.1, 5.0], "radius": 1.0}
+        tables["obstacles"] = [{"kind": "ground"}, ball]
+    elif into == "a fence":
+        corners = [[20.5, 5.5], [23, 5.5], [23, 8.5], [20.5, 8.5]]
+        tables["fences"] = [{"kind": "exclusion", "polygon": corners}]
+    elif into == "air of another":
+        tables["limits"] = {"separation_below": 0.5}
+    form = {"square": {"shape": "square", "size": 4.0}, "place": {"slots": slots}}
+    d = {"lost": [{"agent": lost, "time": 9.0}], "on_loss": "land", "landing_formation": "place"}
+    m = mission(
+        d, formations=form, agents={"mass": 1.0, "radius": RADIUS, "position": START}, **tables
+    )
+    ahead, verdict = check(m, search=False), assess(simulate(m))
+    assert ahead.passed == verdict.passed == (lost == 2), (ahead.remarks, verdict.summary)
+
+
 def test_check_follows_the_way_after_the_loss():
     """It tells where the others stop and when they land, and finds a box that one would scrape."""
     m = mission(LOST | {"on_loss": "land"})

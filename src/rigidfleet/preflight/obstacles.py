@@ -55,7 +55,8 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             compared += planned.position[:, :, 0].size + _EACH
             if compared > _COMPARED:
                 break
-            clearance, agent, time, proved = clearance_to(planned, thing, radius, paces[k])
+            each = np.where(planned.leg.before.lost, -np.inf, radius)  # the lost are nowhere near
+            clearance, agent, time, proved = clearance_to(planned, thing, each, paces[k])
             if clearance - proved > max(unproved.get(b, 0.0), 1.5 * CLEARANCE_ACCURACY):
                 unproved[b] = clearance - proved
             # Among equal minima, take the first one: ignore rounding and the last millimetre of a rest.
@@ -102,7 +103,7 @@ def area_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     watch, worst = BoundaryWatch(mission), dict[tuple[str, bool], tuple[Worst, str]]()
     for planned in preflight.planned_phases if watch.every else ():
         states = np.stack([planned.position, planned.velocity, planned.acceleration])
-        watch.add_way(Piecewise.hermite(planned.time, states))
+        watch.add_way(Piecewise.hermite(planned.time, states), ~planned.leg.before.lost)
         for name, x in watch.search().items():
             at, rank = (name, planned.exact), QUANTITIES[name].rank
             if at not in worst or rank(x.value) > rank(worst[at][0].value):
@@ -133,7 +134,8 @@ def _too_low_in_words(mission: Mission, preflight: Preflight, phase: str, ground
     masses, radius = mission.fleet.mass, mission.fleet.radius
     z = planned.position[..., 2]
     cm = z @ masses / masses.sum()
-    k, i = np.unravel_index(int((z - radius).argmin()), z.shape)
+    low = np.where(planned.leg.before.lost, np.inf, z - radius)
+    k, i = np.unravel_index(int(low.argmin()), z.shape)
     deep, below = ground + radius[i] - z[k, i], cm[k] - z[k, i]
     high = float((ground + radius + cm[:, None] - z)[k].max())
     return (

@@ -144,11 +144,9 @@ class CurveWatch:
 
     def deepest_contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far; None if there was none."""
-        contacts = [
-            x for x in (self._extremum(records.FLYING), self._landing_clearance()) if x is not None
-        ]
-        deepest = min(contacts, key=lambda x: x.value, default=None)
-        return deepest if deepest is not None and deepest.value < -_TOUCH else None
+        nearest = self._extremum(records.FLYING), self._landing_clearance()
+        contacts = [x for x in nearest if x is not None and x.value < -_TOUCH]
+        return min(contacts, key=lambda x: x.value, default=None)
 
     def monitor_paths(
         self, problem: Problem, state: records.IntegratorState, first: int = 0
@@ -250,13 +248,10 @@ class CurveWatch:
 
     def _landing_clearance(self) -> Extremum | None:
         """The least clearance of an agent that has stayed near since, as it may be landing; None if there is none."""
-        near = self.low[:, 0]
-        if math.isfinite(near.min()):
-            near = np.where(self.left & (self.standing == 0), near, np.inf)
-            i = int(near.argmin())
-            if math.isfinite(near[i]):
-                return Extremum(float(near[i]), float(self.low[i, 1]), i, int(self.low[i, 2]))
-        return None
+        near = np.where(self.left & (self.standing == 0), self.low[:, 0], np.inf)
+        i = int(near.argmin())
+        value, when, obstacle = self.low[i].tolist()
+        return Extremum(value, when, i, int(obstacle)) if math.isfinite(near[i]) else None
 
     def _extremum(self, kind: int) -> Extremum | None:
         value = float(self.worst[kind])

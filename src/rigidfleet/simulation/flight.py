@@ -275,8 +275,9 @@ class Flight:
         self._built_in = controller is None and agent is None  # whether the mission's own laws fly
         self.external = ExternalForce(force, mission.n_agents) if force is not None else None
         self._push = External(self.external.address, float(max_step)) if self.external else External()  # fmt: skip
-        own_times = None if times is None else requested_times(times, mission.latest_end)
-        self.sampler = sampler or partial(times_between, mission.output_step, own_times)
+        step = mission.output_step
+        wanted = step if times is None else requested_times(times, mission.latest_end)
+        self.sampler = sampler or partial(times_between, wanted)
         self.flips = flips
         self._reached = state_at_start(mission)
         self._vehicles = (

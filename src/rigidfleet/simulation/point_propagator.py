@@ -35,7 +35,6 @@ class Stretch(NamedTuple):
     times: Floats
     samples: Floats
     fresh: bool  # whether the derivative at the start is not known
-    first: float  # the first time after the start [s]
 
 
 class PointPropagator:
@@ -129,15 +128,15 @@ class PointPropagator:
         at.begun = True
         samples = np.empty((len(times), len(at.state.y)))
         at.state.count[records.SAMPLES] = 0
-        return Stretch(problem, times, samples, fresh, math.nextafter(at.t, math.inf))
+        return Stretch(problem, times, samples, fresh)
 
     def record_samples(self, stretch: Stretch) -> None:
         """Store the samples of what was integrated since `prepare_stretch`."""
         at, plan, state = self.integration, self.integration.plan, self.integration.state
-        problem, times, samples, _, first = stretch
+        problem, times, samples, _ = stretch
         done = int(state.count[records.SAMPLES])
         tried = state.count[records.EVALUATIONS] > 0 and state.count[records.ACCEPTED] == 0
-        if tried and len(times) and times[0] <= first:
+        if tried and len(times) and times[0] <= math.nextafter(at.t, math.inf):
             samples[0], done = state.y, 1  # no step was possible: record the start alone
         if not done:
             return

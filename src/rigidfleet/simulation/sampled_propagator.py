@@ -39,7 +39,7 @@ from rigidfleet.simulation.leading import Leader, layers
 from rigidfleet.simulation.own_laws import Law, OwnLaws, View
 from rigidfleet.simulation.plan_integration import PlanIntegration
 from rigidfleet.simulation.recording import LayerSamples, VehicleSamples
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Floats, Ints
 
 #: Greatest number of ticks in a table, and of steps between two returns to Python.
 _TICKS, _STEPS = 1024, 4000
@@ -339,7 +339,8 @@ class SampledPropagator:
             )
             done = done if finite.all() else int(finite.argmin())
             if done:
-                self._store_flown_samples(problem, call, done)
+                rows = {name: x[:done] for name, x in call._asdict().items() if np.ndim(x)}
+                self._store_flown_samples(problem, call._replace(**rows))
         if self.flight.clocks.own:
             self._postpone_plan_events()
         if not np.isfinite(sampled.S).all():
@@ -412,16 +413,16 @@ class SampledPropagator:
 
     # -- recording --------------------------------------------------------------------------------
 
-    def _store_flown_samples(self, problem: Problem, call: fleet.SampledSegment, done: int) -> None:
+    def _store_flown_samples(self, problem: Problem, call: fleet.SampledSegment) -> None:
         """Store samples: states and forces as flown, references and constraints of the plan."""
-        at, plan = self.integration, self.integration.plan
-        S, times = call.S[:done], call.times[:done]
-        parts = [S[..., :3].reshape(done, -1), S[..., 3:6].reshape(done, -1), call.integral[:done]]
+        at, plan, times, S = self.integration, self.integration.plan, call.times, call.S
+        done = len(times)
+        parts = [S[..., :3].reshape(done, -1), S[..., 3:6].reshape(done, -1), call.integral]
         frame = np.full((done, 4), np.nan)
         if plan.frame is not None:
-            frame = call.frame[:done]
+            frame = call.frame
             parts.append(frame)
-        tau, y = call.tau[:done], np.concatenate(parts, axis=1)
+        tau, y = call.tau, np.concatenate(parts, axis=1)
         if self.flight.clocks.own:
             planned = self._record_by_own_clocks(times, y, tau)
             plan_time = (times - self.vehicles.waited)[:, None, None] + tau[..., :1]
@@ -429,9 +430,9 @@ class SampledPropagator:
         else:
             planned = native.record(plan.problem, at.workspace, times, y)
             tau = tau[..., :0]
-        out, kept = _flown_record(planned, call, done, self.flight, problem, tau)
-        acting = self._avoidance_samples(call, done)
-        at.store_piece(times, out, call.integral[:done], frame, self.turn, kept, acting)
+        out, kept = self._flown_record(planned, call, problem, tau)
+        acting = self._avoidance_samples(times, call.layers)
+        at.store_piece(times, out, call.integral, frame, self.turn, kept, acting)
 
     def _record_by_own_clocks(self, times: Floats, y: Floats, tau: Floats) -> Record:
         """A record at the mean of own clocks ``tau`` (K, N, 3), with forces of now, and the slot by each clock."""
@@ -446,44 +447,35 @@ class SampledPropagator:
             np.multiply(x, rate[:, None], out=x)
         return planned
 
-    def _avoidance_samples(self, call: fleet.SampledSegment, done: int) -> LayerSamples | None:
-        """Samples of what avoidance did."""
+    def _avoidance_samples(self, times: Floats, acting: Ints) -> LayerSamples | None:
+        """Samples of what avoidance did at times (K,) [s], where these layers (K, N) acted."""
         if self.vehicles.avoidance is None:
             return None
-        times, acting = call.times[:done], call.layers[:done]
         if self.leader is None:
-            return LayerSamples(np.ones(done), np.zeros((done, 3)), acting)
+            return LayerSamples(np.ones(len(times)), np.zeros((len(times), 3)), acting)
         return LayerSamples(self.leader.clock_rate(times), self.leader.displacement(times), acting)
 
-
-def _flown_record(
-    planned: Record,
-    call: fleet.SampledSegment,
-    done: int,
-    flight: fleet.SampledFlight,
-    problem: Problem,
-    tau: Floats,
-) -> tuple[Record, VehicleSamples]:
-    """A record of references with the forces of vehicles, and the samples of the vehicles themselves."""
-    S, a, vehicles = call.S[:done], call.dS[:done, :, 3:6], flight.vehicles
-    curves = vehicles.thrust.T[..., None]
-    rotor = np.where(vehicles.point[:, None], 0.0, fleet.thrust_of(S[..., 13:], *curves))
-    T = att.dcm_from_quaternion(np.where(vehicles.point[:, None], [1.0, 0, 0, 0], S[..., 6:10]))
-    thrust = rotor.sum(axis=2)[..., None] * T[..., 2, :]
-    thrust = np.where(vehicles.point[:, None], call.command[:done, :, :3], thrust)
-    rest = vehicles.m[:, None] * a - thrust
-    air = rest + (vehicles.m * vehicles.g)[:, None] * np.array([0.0, 0.0, 1.0])
-    if problem.external.address:
-        air = air - (planned.f_E + (problem.vehicles.m * vehicles.g)[:, None] * [0.0, 0.0, 1.0])
-    seen = call.seen[:done]
-    out = planned._replace(
-        a=a, f_E=rest, f_D=air, f_u=call.f_u[:done], f_C=call.f_C[:done],
-        r_seen=seen[..., :3], v_seen=seen[..., 3:],
-    )  # fmt: skip
-    stamp = call.stamp[:done]
-    sent = np.where(stamp < 0, np.nan, flight.start + stamp * flight.steps * flight.h)
-    kept = VehicleSamples(
-        S[..., 6:10], S[..., 10:13], rotor, np.linalg.norm(thrust, axis=2), call.saturated[:done],
-        call.times[:done, None] - sent, tau,
-    )  # fmt: skip
-    return out, kept
+    def _flown_record(
+        self, planned: Record, call: fleet.SampledSegment, problem: Problem, tau: Floats
+    ) -> tuple[Record, VehicleSamples]:
+        """A record of references with the forces of vehicles, and the samples of the vehicles themselves."""
+        flight, S, a = self.flight, call.S, call.dS[:, :, 3:6]
+        vehicles = flight.vehicles
+        curves = vehicles.thrust.T[..., None]
+        rotor = np.where(vehicles.point[:, None], 0.0, fleet.thrust_of(S[..., 13:], *curves))
+        T = att.dcm_from_quaternion(np.where(vehicles.point[:, None], [1.0, 0, 0, 0], S[..., 6:10]))
+        thrust = rotor.sum(axis=2)[..., None] * T[..., 2, :]
+        thrust = np.where(vehicles.point[:, None], call.command[:, :, :3], thrust)
+        rest = vehicles.m[:, None] * a - thrust
+        air = rest + (vehicles.m * vehicles.g)[:, None] * np.array([0.0, 0.0, 1.0])
+        if problem.external.address:
+            air = air - (planned.f_E + (problem.vehicles.m * vehicles.g)[:, None] * [0.0, 0.0, 1.0])
+        out = planned._replace(
+            a=a, f_E=rest, f_D=air, f_u=call.f_u, f_C=call.f_C, r_seen=call.seen[..., :3], v_seen=call.seen[..., 3:]
+        )  # fmt: skip
+        sent = np.where(call.stamp < 0, np.nan, flight.start + call.stamp * flight.steps * flight.h)
+        kept = VehicleSamples(
+            S[..., 6:10], S[..., 10:13], rotor, np.linalg.norm(thrust, axis=2), call.saturated,
+            call.times[:, None] - sent, tau,
+        )  # fmt: skip
+        return out, kept

@@ -13,14 +13,7 @@ from rigidfleet.typing import Floats
 
 
 def times_between(
-    step: float,
-    times: Floats | None,
-    plan: PhasePlan,
-    t: float,
-    t_end: float,
-    *,
-    first: bool,
-    stop: float,
+    wanted: Floats | float, plan: PhasePlan, t: float, t_end: float, *, first: bool, stop: float
 ) -> Floats:
     """Times in (t, t_end] [s] of a phase to record: those of the user, or multiples of a step [s] and exact moments.
 
@@ -28,10 +21,10 @@ def times_between(
     of a phase, which is ``first`` after a switch, is recorded one representable number later; so is the state after a
     loss.
     """
-    if times is not None:
-        begin = 0 if first and t == 0.0 else times.searchsorted(t, "right")
-        return times[begin : times.searchsorted(t_end, "right")]
-    same = 1e-9 * step  # but for rounding
+    if isinstance(wanted, np.ndarray):
+        begin = 0 if first and t == 0.0 else wanted.searchsorted(t, "right")
+        return wanted[begin : wanted.searchsorted(t_end, "right")]
+    step, same = wanted, 1e-9 * wanted  # but for rounding
     low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
     grid = np.minimum(np.arange(low, high) * step, t_end)
     losses = (*plan.lost_at.tolist(), *plan.links_lost[1].tolist()) if plan.loses else ()

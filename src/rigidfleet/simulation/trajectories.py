@@ -33,7 +33,7 @@ from rigidfleet.math.piecewise import (
     stack_ways,
 )
 from rigidfleet.mission import Mission, as_mission
-from rigidfleet.result import Extremum, PhaseRecord, Result, presence
+from rigidfleet.result import LABELS, Extremum, PhaseRecord, Result, presence
 from rigidfleet.result.result import CLOSE, VARIABLES
 from rigidfleet.setpoints import interval_starts_and_knots
 from rigidfleet.simulation.extremes import CurveWatch
@@ -490,14 +490,8 @@ def result_of(
     time, r = known["time"], known["position"]
     k, n = r.shape[:2]
     left = presence(time, statistics["spans"], n)
-    sizes = {
-        "time": k,
-        "agent": n,
-        "axis": 3,
-        "quaternion": 4,
-        "wrench": 6,
-        "edge": len(known["edges"]),
-    }
+    sizes = {dim: len(names) for dim, names in LABELS.items()}
+    sizes |= {"time": k, "agent": n, "edge": len(known["edges"])}
     nothing = cache(lambda *shape: np.full(shape, np.nan))  # of each shape once
     unknown = {
         name: nothing(*(sizes[dim] for dim in x.dims))
