@@ -12,6 +12,7 @@ from rigidfleet._common.waypoints import LEEWAY
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Mission, Obstacle
 from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
+from rigidfleet.mission.bounds import LENGTH
 from rigidfleet.mission.obstacles import Box, Ground
 from rigidfleet.planning.clearance import CLEARANCE_ACCURACY, clearance_to, speed_bounds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
@@ -55,7 +56,7 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             compared += planned.position[:, :, 0].size + _EACH
             if compared > _COMPARED:
                 break
-            each = np.where(planned.leg.before.lost, -np.inf, radius)  # the lost are nowhere near
+            each = np.where(planned.leg.before.lost, -LENGTH.most, radius)  # the lost are not near
             clearance, agent, time, proved = clearance_to(planned, thing, each, paces[k])
             if clearance - proved > max(unproved.get(b, 0.0), 1.5 * CLEARANCE_ACCURACY):
                 unproved[b] = clearance - proved
