@@ -113,7 +113,9 @@ def test_who_is_left_is_held_against_limits_also_after_a_loss(what, lost):
     whole = [MOVED[what](x).to_dict() for x in (1.0, 1 / 6)]
     for data in whole:
         data["disturbances"]["lost"] = [{"agent": lost, "time": 0.5}]
-        data["phases"].insert(0, data["phases"][0] | {"name": "first", "blend": 1.0, "duration": 1.0})
+        data["phases"].insert(
+            0, data["phases"][0] | {"name": "first", "blend": 1.0, "duration": 1.0}
+        )
     strong, weak = (Mission.from_dict(data) for data in whole)
     verdict, ahead = assess(simulate(strong)), foreseen(check(strong, search=False))
     for topic in ahead:

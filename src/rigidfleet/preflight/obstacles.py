@@ -10,9 +10,8 @@ import numpy as np
 from rigidfleet._common.quantities import PLACES, QUANTITIES
 from rigidfleet._common.waypoints import LEEWAY
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.mission import Mission, Obstacle
+from rigidfleet.mission import Mission, Obstacle, bounds
 from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
-from rigidfleet.mission.bounds import LENGTH
 from rigidfleet.mission.obstacles import Box, Ground
 from rigidfleet.planning.clearance import CLEARANCE_ACCURACY, clearance_to, speed_bounds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
@@ -37,8 +36,8 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
     within = np.array(
         [[planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))] for planned in way]
     )
-    bounds = [_least_distance_bound(within, thing) for thing in mission.obstacles]
-    far = np.stack(bounds, axis=1) - radius.max()
+    apart = [_least_distance_bound(within, thing) for thing in mission.obstacles]
+    far = np.stack(apart, axis=1) - radius.max()
     compared, skipped = 0, []
     unproved: dict[int, float] = {}
     paces = [speed_bounds(planned) for planned in way]
@@ -56,7 +55,9 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             compared += planned.position[:, :, 0].size + _EACH
             if compared > _COMPARED:
                 break
-            each = np.where(planned.leg.before.lost, -LENGTH.most, radius)  # the lost are not near
+            each = np.where(
+                planned.leg.before.lost, -bounds.LENGTH.most, radius
+            )  # the lost are not near
             clearance, agent, time, proved = clearance_to(planned, thing, each, paces[k])
             if clearance - proved > max(unproved.get(b, 0.0), 1.5 * CLEARANCE_ACCURACY):
                 unproved[b] = clearance - proved
