@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -101,7 +101,6 @@ class CurveWatch:
         self.spare, self.moved = 0.0, np.zeros(2)
         self.touched: dict[str, Extremum] = {}  # first contacts of the flight
         self._list_all_pairs()
-        self._begin_monitor(6 * self.n, 0)
 
     def _set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         corners = [thing.box_bounds for thing in obstacles]
@@ -111,9 +110,14 @@ class CurveWatch:
             self.solids, corners = join_solids([thing.solid for thing in obstacles]), []
         self.boxes = np.array(corners).reshape(-1, 6)
 
-    def _begin_monitor(self, states: int, gauge: int) -> None:
-        """Begin to monitor trails of so many states and forces."""
-        self.monitor = native.Watch(
+    @cached_property
+    def monitor(self) -> native.Watch:
+        """What monitors: curves of positions and velocities, unless a flight begins to monitor a trail of its own."""
+        return self._new_monitor(6 * self.n, 0)
+
+    def _new_monitor(self, states: int, gauge: int) -> native.Watch:
+        """A monitor of trails of so many states and forces."""
+        return native.Watch(
             records.new_monitor(
                 self.radius, self.boxes, self.fence, states, gauge,
                 worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
@@ -369,7 +373,7 @@ class Extremes(CurveWatch):
         if size != self.size:  # else the memory of the phase before serves this one
             self.size = size
             self.trail = records.new_trail(room, states, self.n, edges, self.directed)
-            self._begin_monitor(states, self.trail.gauge.shape[1])
+            self.monitor = self._new_monitor(states, self.trail.gauge.shape[1])
         return self.trail
 
     def remove_lost(self, lost: Bools) -> None:
