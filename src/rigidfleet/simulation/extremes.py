@@ -355,7 +355,6 @@ class Extremes(CurveWatch):
         super().__init__(mission)
         #: States in the trail, and edges, for which there is a monitor.
         self.size: tuple[int, int] | None = None
-        self.trail: records.Trail
         self._thread: ThreadPoolExecutor | None = None  # of large formations
         self._taking: Future[None] | None = None
         self.of_vehicles: dict[str, Extremum] = {}
