@@ -469,6 +469,32 @@ def test_some_leave_and_the_others_fly_on(agents: list[int], T: float) -> None:
     assert all(np.abs(away[k - 1]).max() > 0.01 for k in agents) or T < 10.0
 
 
+def test_who_stays_in_a_plan_that_ends_in_motion_flies_it_to_its_end() -> None:
+    """The last second of an orbit is the plan's, and so is its separation, which the way home promises."""
+    formation = {"slots": [[0, 0, 0], [3, 0, 0], [3, 3, 0], [0, 3, 0]]}
+    phases = [
+        {"kind": "takeoff", "height": 8.0, "duration": 8.0},
+        {"kind": "establish", "formation": "square", "duration": 8.0},
+        {"kind": "orbit", "centre": [0, 0, 8], "radius": 8.0, "rate_deg_s": 9.0, "duration": 20.0, "yaw": "along"},
+    ]  # fmt: skip
+    data = {
+        "schema_version": 1, "name": "orbit", "smoothness": "jerk", "phases": phases, "limits": {"separation": 1.0},
+        "agents": {"mass": 1.0, "radius": 0.2, "position": [[0, 0, 0.2], [3, 0, 0.2], [3, 3, 0.2], [0, 3, 0.2]]},
+        "formations": {"square": formation}, "obstacles": [{"kind": "ground"}],
+    }  # fmt: skip
+    plain, result = (
+        rf.simulate(Mission.from_dict(data | more))
+        for more in ({}, {"abort": {"at": 20.0, "agents": [3]}})
+    )
+    assert rf.assess(result).passed, rf.assess(result).summary
+    others = [0, 1, 3]
+    assert np.linalg.norm(plain.velocity[-1, others], axis=1).min() > 0.5
+    t = np.linspace(plain.time[-1] - 1.0, plain.time[-1], 50)
+    for i, q in itertools.product(others, range(3)):
+        a, b = (np.interp(t, x.time, x.velocity[:, i, q]) for x in (plain, result))
+        assert np.abs(a - b).max() < 1e-3
+
+
 def test_files_of_those_who_stay_lead_on(tmp_path: Path) -> None:
     """Who leaves has ways home in its file; the others have none, and fly their own trajectories to the end."""
     check_aborts(show(agents=[3], step=5.0)).write(tmp_path)

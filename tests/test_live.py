@@ -529,7 +529,7 @@ def test_kept_in_bounded_memory():
     pilot = Pilot(TRIANGLE)
     pilot.archive.most = 20_000.0
     records = by_hand(pilot, 40.0, change=20.0)
-    kept = sum(sum(x.size for x in p.forces_and_references) for p in pilot.archive.pieces())
+    kept = sum(sum(x.size for x in p.record) for p in pilot.archive.pieces())
     assert kept < 25_000  # with ends
     assert pilot.archive.step > 0.05
     result = pilot.result()

@@ -11,6 +11,7 @@ import rigidfleet as rf
 from rigidfleet import assess, check, simulate
 from rigidfleet.errors import MissionError
 from rigidfleet.math import splines
+from rigidfleet.math.attitude import angle_between
 from rigidfleet.mission import Mission
 from rigidfleet.result import Result
 from rigidfleet.web.live.pilot import Pilot
@@ -386,6 +387,20 @@ def test_a_second_loss_does_not_begin_anew():
     assert assess(result).passed
 
 
+@pytest.mark.parametrize("second", [2, 3, 4])
+def test_two_that_are_left_show_the_attitude_that_they_are_led_in(second):
+    """Two vehicles are a line, whose attitude is the commanded one as far as they show it; it was one by chance."""
+    slots = [[0.5, -2.0, -1.5], [0.5, 2.0, -1.5], [-0.5, -2.0, 1.5], [-0.5, 2.0, 1.5]]
+    lost = [{"agent": 1, "time": 8.0}, {"agent": second, "time": 12.0}]
+    form = {"square": {"slots": slots}}
+    result = simulate(mission({"lost": lost, "on_loss": "hold"}, formations=form))
+    assert names(result)[-1] == "hold (loss)"
+    off = angle_between(result.attitude, result.attitude_reference)[result.time > 12.0]
+    assert len(off) > 10
+    assert np.degrees(off).max() < 1e-3
+    assert assess(result).by_name["waypoint_attitude"].passed
+
+
 def test_without_a_loss_nothing_changes():
     """A mission that ends before its loss, or loses nothing, flies to its end."""
     plain = simulate(mission({"wind": [1.0, 0.0, 0.0]}))
@@ -562,6 +577,30 @@ def test_the_loss_of_a_link_is_answered(on_loss):
 
 
 # -- before the flight --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lost", [2, 3])
+@pytest.mark.parametrize("into", ["another", "a ball", "a fence", "air of another"])
+def test_a_lost_vehicle_is_where_others_would_lead_it_no_more(lost, into):
+    """The slot of agent 2 in the landing is where no vehicle may be: check and flight fail unless agent 2 is lost."""
+    slots = [[0.0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]]
+    slots[1] = {"another": [0.3, 0, 0], "air of another": [0.4, 0, 0]}.get(into, [8, 0, 0])
+    tables: dict[str, Any] = {}
+    if into == "a ball":
+        ball = {"kind": "sphere", "centre": [21.9, 7.1, 5.0], "radius": 1.0}
+        tables["obstacles"] = [{"kind": "ground"}, ball]
+    elif into == "a fence":
+        corners = [[20.5, 5.5], [23, 5.5], [23, 8.5], [20.5, 8.5]]
+        tables["fences"] = [{"kind": "exclusion", "polygon": corners}]
+    elif into == "air of another":
+        tables["limits"] = {"separation_below": 0.5}
+    form = {"square": {"shape": "square", "size": 4.0}, "place": {"slots": slots}}
+    d = {"lost": [{"agent": lost, "time": 9.0}], "on_loss": "land", "landing_formation": "place"}
+    m = mission(
+        d, formations=form, agents={"mass": 1.0, "radius": RADIUS, "position": START}, **tables
+    )
+    ahead, verdict = check(m, search=False), assess(simulate(m))
+    assert ahead.passed == verdict.passed == (lost == 2), (ahead.remarks, verdict.summary)
 
 
 def test_check_follows_the_way_after_the_loss():

@@ -106,6 +106,25 @@ def test_every_limit_that_an_offset_moves_is_held_against_it(what):
     assert not foreseen(check(weak, search=False))
 
 
+@pytest.mark.parametrize("what", MOVED)
+@pytest.mark.parametrize("lost", [1, 4])
+def test_who_is_left_is_held_against_limits_also_after_a_loss(what, lost):
+    """With one of four lost at the start, what is foreseen fails in flight, and a sixth of it is not foreseen."""
+    whole = [MOVED[what](x).to_dict() for x in (1.0, 1 / 6)]
+    for data in whole:
+        data["disturbances"]["lost"] = [{"agent": lost, "time": 0.5}]
+        data["phases"].insert(
+            0, data["phases"][0] | {"name": "first", "blend": 1.0, "duration": 1.0}
+        )
+    strong, weak = (Mission.from_dict(data) for data in whole)
+    verdict, ahead = assess(simulate(strong)), foreseen(check(strong, search=False))
+    for topic in ahead:
+        assert failed(verdict) & set(FORESEEN[topic]), (topic, verdict.summary)
+    fails = failed(verdict) & set(FORESEEN[what])
+    assert (what in ahead) == bool(fails), (ahead, verdict.summary)
+    assert not foreseen(check(weak, search=False))
+
+
 @pytest.mark.parametrize(
     ("tolerance", "fails"),
     [({}, True), ({"tolerance": 0.5}, False), ({"tolerance_share": 0.2}, False)],

@@ -164,6 +164,7 @@ def width_length_and_axis(p, mass, C, V, w, axis):
 
     For slots too wide to be a line, two numbers with a ratio that shows this, and no axis.
     """
+    C[:] = 0.0  # a fit before may have used a fourth row
     for a in range(3):
         axis[a] = 0.0
         for b in range(a + 1):

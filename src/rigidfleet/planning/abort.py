@@ -653,12 +653,14 @@ class Aborts:
 
     def _ways_of_all(self, begins: float, waits: float, steps: Sequence[Step]) -> Piecewise:
         """The ways from a time on [s] of those that wait so long and then fly steps, and of the others, by the plan."""
-        last = np.array([max(begins, self.plan_end - _TOUCHING), self.plan_end])
-        states = self.plan.states(last, 4)
-        states[1:, 1] = 0.0  # a landing ends with the speed at which it touches down
-        ways = [Piecewise.hermite(last, states).shift_time(-last[0])]
+        lands, end = self.mission_lands, self.plan_end
+        last, ways = np.array([max(begins, end - _TOUCHING * lands), end]), list[Piecewise]()
         if last[0] > begins:
-            ways.insert(0, self.plan.between(begins, last[0]).shift_time(-begins))
+            ways.append(self.plan.between(begins, last[0]).shift_time(-begins))
+        if lands:
+            states = self.plan.states(last, 4)
+            states[1:, 1] = 0.0  # a landing ends with the speed at which it touches down
+            ways.append(Piecewise.hermite(last, states).shift_time(-last[0]))
         on = concatenate_curves(ways)
         before = [on.between(0.0, waits)] if waits else []
         own = concatenate_curves([*before, *(step.way for step in steps)])

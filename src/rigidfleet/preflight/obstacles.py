@@ -10,7 +10,7 @@ import numpy as np
 from rigidfleet._common.quantities import PLACES, QUANTITIES
 from rigidfleet._common.waypoints import LEEWAY
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.mission import Mission, Obstacle
+from rigidfleet.mission import Mission, Obstacle, bounds
 from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
 from rigidfleet.mission.obstacles import Box, Ground
 from rigidfleet.planning.clearance import CLEARANCE_ACCURACY, clearance_to, speed_bounds
@@ -36,8 +36,8 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
     within = np.array(
         [[planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))] for planned in way]
     )
-    bounds = [_least_distance_bound(within, thing) for thing in mission.obstacles]
-    far = np.stack(bounds, axis=1) - radius.max()
+    apart = [_least_distance_bound(within, thing) for thing in mission.obstacles]
+    far = np.stack(apart, axis=1) - radius.max()
     compared, skipped = 0, []
     unproved: dict[int, float] = {}
     paces = [speed_bounds(planned) for planned in way]
@@ -55,7 +55,10 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             compared += planned.position[:, :, 0].size + _EACH
             if compared > _COMPARED:
                 break
-            clearance, agent, time, proved = clearance_to(planned, thing, radius, paces[k])
+            each = np.where(
+                planned.leg.before.lost, -bounds.LENGTH.most, radius
+            )  # the lost are not near
+            clearance, agent, time, proved = clearance_to(planned, thing, each, paces[k])
             if clearance - proved > max(unproved.get(b, 0.0), 1.5 * CLEARANCE_ACCURACY):
                 unproved[b] = clearance - proved
             # Among equal minima, take the first one: ignore rounding and the last millimetre of a rest.
@@ -101,7 +104,7 @@ def area_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     watch, worst = BoundaryWatch(mission), dict[tuple[str, bool], tuple[Worst, str]]()
     for planned in preflight.flown_phases if watch.every else ():
         states = np.stack([planned.position, planned.velocity, planned.acceleration])
-        watch.add_way(Piecewise.hermite(planned.time, states))
+        watch.add_way(Piecewise.hermite(planned.time, states), ~planned.leg.before.lost)
         for name, x in watch.search().items():
             at, rank = (name, planned.exact), QUANTITIES[name].rank
             if at not in worst or rank(x.value) > rank(worst[at][0].value):
@@ -132,7 +135,8 @@ def _too_low_in_words(mission: Mission, preflight: Preflight, phase: str, ground
     masses, radius = mission.fleet.mass, mission.fleet.radius
     z = planned.position[..., 2]
     cm = z @ masses / masses.sum()
-    k, i = np.unravel_index(int((z - radius).argmin()), z.shape)
+    low = np.where(planned.leg.before.lost, np.inf, z - radius)
+    k, i = np.unravel_index(int(low.argmin()), z.shape)
     deep, below = ground + radius[i] - z[k, i], cm[k] - z[k, i]
     high = float((ground + radius + cm[:, None] - z)[k].max())
     return (

@@ -8,6 +8,7 @@ constraint law. Gusts and noise are left out: they have no mean.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import replace
 from functools import partial
 
@@ -20,6 +21,7 @@ from rigidfleet.math.margins import constraint_filter_matrix
 from rigidfleet.math.pid import matrix_exponential
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import PlannedPhase
+from rigidfleet.planning.reference import copy_with
 from rigidfleet.planning.vehicles import drag_and_lift, pair_jet_speeds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
@@ -75,7 +77,9 @@ def _unmodelled_accelerations(mission: Mission, planned: PlannedPhase) -> Floats
     up = np.array([0.0, 0.0, 1.0])
     air = np.array(d.wind)
     if d.downwash and mission.n_agents <= STACKED:
-        air = air - pair_jet_speeds(mission, planned.position).sum(axis=2)[..., None] * up
+        jets = pair_jet_speeds(mission, planned.position)
+        jets[np.broadcast_to((planned.time[:, None] > mission.lost_at)[:, None], jets.shape)] = 0.0
+        air = air - jets.sum(axis=2)[..., None] * up
     force = drag_and_lift(mission, air - v)
     if mission.tracking.drag_feedforward:
         known = drag_and_lift(mission, -v)
@@ -117,9 +121,11 @@ def steady_offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Re
     if not mission.tracking.integral:
         remedy = f"; tracking has no integral: raise the first weight in tracking.Q (now {mission.tracking.Q[0]:g})"
         remedy += ", or set tracking.integral" if mission.vehicle_models is not None else ""
-    for planned, off in zip(way, sampled_tracking_offsets(mission, way), strict=True):
+    for phase, every in zip(way, sampled_tracking_offsets(mission, way), strict=True):
+        planned, whole = _planned_for_those_left(mission, phase)
+        off = np.where(planned.leg.before.lost[:, None], 0.0, every)
         far = float(np.linalg.norm(off, axis=2).max())
-        if planned.leg.end > mission.first_loss or far < _LEAST:
+        if far < _LEAST:
             continue
         broken = partial(_broken_limits_in_words, mission, preflight, planned)
         if not (now := broken(off)):
@@ -127,11 +133,21 @@ def steady_offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Re
         own, surely = broken(0.0 * off), broken(max(0.0, _SURE - gusts / far) * off)
         for topic in (topic for topic in now if topic not in own):
             evaded = is_left_to_avoidance(mission, topic, mission.limits.separation or 0.0)
-            fails = planned.exact and topic in surely and not evaded
+            fails = planned.exact and whole and topic in surely and not evaded
             text = f"steady disturbances push vehicles up to {far:.2g} m off their slots in '{planned.phase}'"
             remark = Remark("fails" if fails else "note", topic, f"{text}: {now[topic]}{remedy}")
             remarks.setdefault((topic, fails), remark)
     yield from remarks.values()
+
+
+def _planned_for_those_left(mission: Mission, planned: PlannedPhase) -> tuple[PlannedPhase, bool]:
+    """A planned phase without those who are lost by its end, and whether none is lost on the way."""
+    leg, lost = copy(planned.leg), mission.lost_at < planned.leg.end
+    if not lost.any():
+        return planned, True
+    vars(leg).pop("certificate", None)
+    vars(leg).update(before=copy_with(leg.before, lost=lost))
+    return replace(planned, leg=leg), bool((mission.lost_at[lost] <= leg.start).all())
 
 
 def _broken_limits_in_words(
@@ -139,7 +155,8 @@ def _broken_limits_in_words(
 ) -> dict[str, str]:
     """Topic and words of the limits that a planned phase breaks with offsets (K, N, 3) [m]."""
     leg, phase, limits = planned.leg, planned.leg.phase, mission.limits
-    masses, r, far = mission.fleet.mass, planned.position + offsets, np.linalg.norm(offsets, axis=2)
+    left, r, far = ~leg.before.lost, planned.position + offsets, np.linalg.norm(offsets, axis=2)
+    masses = np.where(left, mission.fleet.mass, 0.0)
     moved = replace(planned, position=r, path_ends=None)
     there = Preflight(mission, preflight.formations, preflight.gains, [moved], [moved])
     remarks = [*separation_remarks(mission, there), *downwash_remarks(mission, there)]
@@ -174,10 +191,11 @@ def _broken_limits_in_words(
         turn = rigid_body.kabsch(r[k], planned.position[k], masses, near=np.eye(3))
         by = float(np.degrees(np.linalg.norm(att.rotation_vector_from_dcm(turn))))
         held.append(("attitude", "", by, WAYPOINT_TOLERANCE["attitude"]))
-    last, name = planned is preflight.flown_phases[-1], leg.planned_end_state.formation
-    if name and (phase.shaping is not None or last) and 1 < len(masses) <= STACKED:
+    last = leg.end == preflight.flown_phases[-1].leg.end
+    name = leg.planned_end_state.formation
+    if name and (phase.shaping is not None or last) and left.sum() > 1 and len(left) <= STACKED:
         # To first order: a turn of the whole changes no distance.
-        i, j = proximity.all_pairs(len(masses))
+        i, j = np.flatnonzero(left)[proximity.all_pairs(int(left.sum()))]
         apart = planned.position[-1, i] - planned.position[-1, j]
         moved = offsets[-1, i] - offsets[-1, j]
         length = np.linalg.norm(apart, axis=1)

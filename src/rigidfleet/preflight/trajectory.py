@@ -46,18 +46,20 @@ def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         ends: list[_Nearest] = []
         positions = planned.position if planned.path_ends is None else np.array(planned.path_ends)
         # Where separation begins at an altitude, agents below it are left to the verdict.
-        flying = positions[..., 2] >= (-np.inf if lowest is None else lowest)
+        left = ~planned.leg.before.lost
+        flying = (positions[..., 2] >= (-np.inf if lowest is None else lowest)) & left
         separations, pairs = proximity.separation_of_remaining(positions, radius, flying)
+        all_fly = flying[:, left].all()
         for k in [int(separations.argmin())] if planned.path_ends is None else [0, -1]:
             ends.append((float(separations[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
-        bent = len(planned.leg.reference.knots) and planned.path_ends is None and flying.all()
+        bent = len(planned.leg.reference.knots) and planned.path_ends is None and all_fly
         if bent and (proved := planned.leg.certificate) is not None:
             ends = [proved[:3]]
         if planned.path_ends is not None:
             certificate = planned.leg.certificate or prove_blend(planned.leg.reference, radius)
             crossing, separation = certificate[:3], certificate.separation
             least = min(least, crossing)
-            beyond = flying.all() and (separation <= 0 or separation < limit - LEEWAY)
+            beyond = all_fly and (separation <= 0 or separation < limit - LEEWAY)
             if beyond and separation < min(ends)[0] - LEEWAY:
                 yield _crossing_remark(mission, planned, crossing)
         for k, at in enumerate(ends):
@@ -115,7 +117,8 @@ def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
     radius, limit = mission.fleet.radius, mission.limits.separation_below
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     for planned in preflight.flown_phases:
-        height, pair = proximity.headroom(planned.position, radius)
+        left = np.broadcast_to(~planned.leg.before.lost, planned.position.shape[:2])
+        height, pair = proximity.headroom(planned.position, radius, left)
         k = int(height.argmin())
         if height[k] < worst.get(planned.exact, (np.inf,))[0]:
             low, high = sorted(pair[k].tolist(), key=lambda i: planned.position[k, i, 2])

@@ -258,12 +258,10 @@ class Result(Shown):
         ends = math.isfinite(time[0]) and math.isfinite(time[-1])
         if not (ends and (time[1:] > time[:-1]).all()):
             raise ValueError("time must be finite and strictly increasing")
-        falls = (phase[1:] < phase[:-1]).any()
-        least, most = (phase.min(), phase.max()) if falls else (phase[0], phase[-1])
-        if least < 0 or most >= len(self.phases):
-            raise ValueError(f"phase has indices outside 0 to {len(self.phases) - 1}")
-        if falls:
+        if (phase[1:] < phase[:-1]).any():
             raise ValueError("phase must not decrease")
+        if phase[0] < 0 or phase[-1] >= len(self.phases):
+            raise ValueError(f"phase has indices outside 0 to {len(self.phases) - 1}")
         n = sizes["agent"]
         for name, least in (("edges", 0), ("separation_pair", -1), ("clearance_agent", -1)):
             who = values.get(name)  # None if it is made later

@@ -40,12 +40,11 @@ def mission_as_flown(
     if pushed:
         tables = [thing.model_dump(mode="json", exclude_unset=True) for thing in pushed]
         data["obstacles"] = [*own, *tables]
-    original = dict(data)
-    data |= _changes_as_flown(mission, data, begun, records, step)
     try:
-        return mission.rewritten(data, "<dict>"), records
+        changed = data | _changes_as_flown(mission, begun, records, step)
+        return mission.rewritten(changed, "<dict>"), records
     except MissionError:
-        return mission.rewritten(original, "<dict>"), records
+        return mission.rewritten(data, "<dict>"), records
 
 
 def phase_of_table(
@@ -62,7 +61,7 @@ def phase_of_table(
     if flown:
         # Names may repeat: those of phases before are not the new one's business.
         before = [replace(record, name=f"before {k}") for k, record in enumerate(flown, start=1)]
-        data |= _changes_as_flown(mission, data, begun, before, mission.output_step)
+        data |= _changes_as_flown(mission, begun, before, mission.output_step)
     else:
         data["phases"] = []
     data["phases"] = [*data["phases"], dict(table)]
@@ -134,15 +133,10 @@ def _make_names_unique(flown: Sequence[PhaseRecord]) -> list[PhaseRecord]:
 
 
 def _changes_as_flown(
-    mission: Mission,
-    own: Mapping[str, Any],
-    begun: Sequence[Phase],
-    records: Sequence[PhaseRecord],
-    step: float,
+    mission: Mission, begun: Sequence[Phase], records: Sequence[PhaseRecord], step: float
 ) -> dict[str, Any]:
-    """What differs from the data of a mission, ``own``, with these phases in place of its own."""
-    data: dict[str, Any] = {}
-    end = records[-1].t_end
+    """What differs from the data of a mission with these phases in place of its own."""
+    data, own, end = dict[str, Any](), mission.to_dict(), records[-1].t_end
     data["output_step"] = min(step, end)
     if mission.assignment != "given":
         # The assignment of agents to slots followed from phases that were not flown.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -69,8 +69,6 @@ _OF_PHASE = np.array(list(_NAMES.values()))
 class CurveWatch:
     """Watches curves of vehicles, and reports their worst values in continuous time."""
 
-    monitor: native.Watch
-
     def __init__(self, mission: Mission, t: float = 0.0) -> None:
         """Watch vehicles that begin at a time [s]."""
         fleet, obstacles, limits = mission.fleet, mission.obstacles, mission.limits
@@ -112,9 +110,14 @@ class CurveWatch:
             self.solids, corners = join_solids([thing.solid for thing in obstacles]), []
         self.boxes = np.array(corners).reshape(-1, 6)
 
-    def _begin_monitor(self, states: int, gauge: int) -> None:
-        """Begin to monitor trails of so many states and forces."""
-        self.monitor = native.Watch(
+    @cached_property
+    def monitor(self) -> native.Watch:
+        """What monitors: curves of positions and velocities, unless a flight begins to monitor a trail of its own."""
+        return self._new_monitor(6 * self.n, 0)
+
+    def _new_monitor(self, states: int, gauge: int) -> native.Watch:
+        """A monitor of trails of so many states and forces."""
+        return native.Watch(
             records.new_monitor(
                 self.radius, self.boxes, self.fence, states, gauge,
                 worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
@@ -129,34 +132,28 @@ class CurveWatch:
         The first 3N are positions [m], the others velocities [m/s], world axes.
         """
         # Of a problem, the monitor of curves reads how many vehicles there are, and of an integrator the trail alone.
-        problem, work = packing.example_of(Problem), packing.example_of(Workspace)
-        state = packing.example_of(records.IntegratorState)
+        problem, state = packing.example_of(Problem), packing.example_of(records.IntegratorState)
         problem = problem._replace(vehicles=problem.vehicles._replace(m=np.ones(self.n)))
         trail = state.trail._replace(clock=clock, points=points)
-        if "monitor" not in vars(self):
-            self._begin_monitor(points.shape[2], 0)
         count = np.zeros_like(state.count)
         count[records.TRAILED] = len(clock)
-        self.monitor_paths(problem, work, state._replace(trail=trail, count=count))
+        self.monitor_paths(problem, state._replace(trail=trail, count=count))
 
     def keep_agents(self, left: Bools) -> None:
         """Continue with the vehicles ``left`` (N,) alone, as if the others were not there."""
         self.left[:] = left
         self._list_all_pairs()
-        if "monitor" in vars(self):
-            self._watch_listed_pairs(0.0)
+        self._watch_listed_pairs(0.0)
         self.moved[:] = np.inf  # of a large fleet, no pairs are listed yet
 
     def deepest_contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far; None if there was none."""
-        contacts = [
-            x for x in (self._extremum(records.FLYING), self._landing_clearance()) if x is not None
-        ]
-        deepest = min(contacts, key=lambda x: x.value, default=None)
-        return deepest if deepest is not None and deepest.value < -_TOUCH else None
+        nearest = self._extremum(records.FLYING), self._landing_clearance()
+        contacts = [x for x in nearest if x is not None and x.value < -_TOUCH]
+        return min(contacts, key=lambda x: x.value, default=None)
 
     def monitor_paths(
-        self, problem: Problem, work: Workspace, state: records.IntegratorState, first: int = 0
+        self, problem: Problem, state: records.IntegratorState, first: int = 0
     ) -> None:
         """Evaluate the paths alone of the steps in a trail from ``first`` on, not the forces."""
         steps = int(state.count[records.TRAILED])
@@ -169,13 +166,13 @@ class CurveWatch:
             for step in range(first, steps):
                 row = _trail_rows(state, (step,))
                 part = state.trail.clock[row], state.trail.points[row]
-                self._watch_step(problem, work, state, *part)
+                self._watch_step(problem, state, *part)
             return
         self.monitor.search_distances(problem, state, first, steps)
-        self._find_first_contacts(problem, work, state, range(first, steps))
+        self._find_first_contacts(problem, state, range(first, steps))
 
     def _find_first_contacts(
-        self, problem: Problem, work: Workspace, state: records.IntegratorState, step_indices: range
+        self, problem: Problem, state: records.IntegratorState, step_indices: range
     ) -> None:
         """Find the first contact of each kind in some steps of the trail, if there has been none before.
 
@@ -184,7 +181,7 @@ class CurveWatch:
         for name, kind in _CONTACTS.items():
             if name in self.touched or not self.worst[kind] < -_TOUCH:
                 continue
-            deepest = partial(self._deepest_contact_of_kind, kind, problem, work, state)
+            deepest = partial(self._deepest_contact_of_kind, kind, problem, state)
             rows = _trail_rows(state, step_indices)
             steps, points = state.trail.clock[rows], state.trail.points[rows]
             while steps[-1].sum() - steps[0, 0] > _INSTANT:
@@ -197,7 +194,7 @@ class CurveWatch:
                 self.touched[name] = contact
 
     def _deepest_contact_of_kind(
-        self, kind: int, problem: Problem, work: Workspace, state: Any, *steps: Floats
+        self, kind: int, problem: Problem, state: Any, *steps: Floats
     ) -> Extremum | None:
         """The deepest contact of a kind in steps (S, 2), (S, 5, n) of an integrator; None if there is none."""
         trail = records.Trail(*steps, *state.trail[2:])
@@ -255,13 +252,10 @@ class CurveWatch:
 
     def _landing_clearance(self) -> Extremum | None:
         """The least clearance of an agent that has stayed near since, as it may be landing; None if there is none."""
-        near = self.low[:, 0]
-        if math.isfinite(near.min()):
-            near = np.where(self.left & (self.standing == 0), near, np.inf)
-            i = int(near.argmin())
-            if math.isfinite(near[i]):
-                return Extremum(float(near[i]), float(self.low[i, 1]), i, int(self.low[i, 2]))
-        return None
+        near = np.where(self.left & (self.standing == 0), self.low[:, 0], np.inf)
+        i = int(near.argmin())
+        value, when, obstacle = self.low[i].tolist()
+        return Extremum(value, when, i, int(obstacle)) if math.isfinite(near[i]) else None
 
     def _extremum(self, kind: int) -> Extremum | None:
         value = float(self.worst[kind])
@@ -281,12 +275,7 @@ class CurveWatch:
             )
 
     def _watch_step(
-        self,
-        problem: Problem,
-        work: Workspace,
-        state: records.IntegratorState,
-        clock: Floats,
-        points: Floats,
+        self, problem: Problem, state: records.IntegratorState, clock: Floats, points: Floats
     ) -> None:
         """Monitor the distances of one step (1, 2), (1, 5, n), in which only the listed pairs matter.
 
@@ -304,11 +293,11 @@ class CurveWatch:
             self._list_near_pairs(problem, points[0, 0], far)
             if moved.max() > self.spare:
                 for half in zip(*_half_steps_and_points(begin, length, points[0]), strict=True):
-                    self._watch_step(problem, work, state, *(x[None] for x in half))
+                    self._watch_step(problem, state, *(x[None] for x in half))
                 return
         self.moved += moved
         self.monitor.search_distances(problem, alone, 0, 1)
-        self._find_first_contacts(problem, work, alone, range(1))
+        self._find_first_contacts(problem, alone, range(1))
 
     def _list_near_pairs(self, problem: Problem, y: Floats, moves: float) -> None:
         """List the pairs that are near each other, or one below the other, at a state (n,).
@@ -366,7 +355,6 @@ class Extremes(CurveWatch):
         super().__init__(mission)
         #: States in the trail, and edges, for which there is a monitor.
         self.size: tuple[int, int] | None = None
-        self.trail = records.NO_TRAIL
         self._thread: ThreadPoolExecutor | None = None  # of large formations
         self._taking: Future[None] | None = None
         self.of_vehicles: dict[str, Extremum] = {}
@@ -376,29 +364,16 @@ class Extremes(CurveWatch):
     def replace_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Continue among these obstacles; the first of them are those before."""
         self._set_obstacles(obstacles)
-        if "monitor" in vars(self):
-            self._replace_monitor_arrays(boxes=self.boxes)
+        self._replace_monitor_arrays(boxes=self.boxes)
 
-    def begin_monitoring(
-        self,
-        y: Floats,
-        t: float,
-        edges: int,
-        *,
-        rtol: float,
-        atol: Floats,
-        states: int | None = None,
-    ) -> records.IntegratorState:
-        """Begin to monitor an integrator, which starts from state y (n,) at t [s]; its trail records its steps.
-
-        ``states``: how many the trail records of vehicles; of points, it records all.
-        """
-        size = states or len(y), edges
+    def begin_monitoring(self, states: int, edges: int, room: int) -> records.Trail:
+        """Begin to monitor a trail, which has room for so many steps, of so many states and edges; return it."""
+        size = states, edges
         if size != self.size:  # else the memory of the phase before serves this one
-            self.size, room = size, records.VEHICLES_TRAIL if states else records.POINTS_TRAIL
-            self.trail = records.new_trail(room, size[0], self.n, edges, self.directed)
-            self._begin_monitor(size[0], self.trail.gauge.shape[1])
-        return records.integrator(y, t, rtol=rtol, atol=atol, trail=self.trail)
+            self.size = size
+            self.trail = records.new_trail(room, states, self.n, edges, self.directed)
+            self.monitor = self._new_monitor(states, self.trail.gauge.shape[1])
+        return self.trail
 
     def remove_lost(self, lost: Bools) -> None:
         """Continue without the vehicles ``lost`` (N,), which must not hit the others."""
@@ -420,7 +395,7 @@ class Extremes(CurveWatch):
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
     ) -> None:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
-        self.monitor_paths(problem, work, state, int(self.monitor.monitor.count[records.STAYED]))
+        self.monitor_paths(problem, state, int(self.monitor.monitor.count[records.STAYED]))
         self.monitor.search_forces(problem, work, state, last=last)
 
     def steps_until_trail_full(self, state: records.IntegratorState) -> int:
@@ -457,16 +432,11 @@ class Extremes(CurveWatch):
                 raise error
 
     def take_vehicle_extremes(
-        self,
-        state: fleet.SampledState,
-        vehicles: fleet.Quadrotors,
-        gone: Bools,
-        lost: Bools,
-        ticks: int,
+        self, state: fleet.SampledState, vehicles: fleet.Quadrotors, gone: Bools, ticks: int
     ) -> None:
         """Take the extremes that a sampled flight keeps by itself, of a phase of some ticks so far.
 
-        Vehicles ``gone`` (N,) were lost before the phase; those that are ``lost`` (N,) in it count up to then.
+        Vehicles ``gone`` (N,) were lost before the phase; those that are lost in it count up to then.
         """
         self.of_vehicles = {}
         rotors, left = ~(vehicles.point | gone), np.flatnonzero(~gone)
@@ -489,7 +459,7 @@ class Extremes(CurveWatch):
         error = np.where(gone, -1.0, np.nan_to_num(state.worst[:, fleet.ERROR], posinf=-1.0))
         if error.max() > 0.0:
             rows["tracking_error"] = error, state.worst_time[:, fleet.ERROR]
-        share = np.where(lost, 0.0, state.saturations / max(ticks, 1))
+        share = np.where(vehicles.lost, 0.0, state.saturations / max(ticks, 1))
         rows["saturation"] = share, np.full(self.n, state.clock[fleet.TIME])
         for name, (values, times) in rows.items():
             i = int(values.argmax())

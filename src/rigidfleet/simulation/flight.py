@@ -47,7 +47,7 @@ from rigidfleet.simulation.plan_integration import PlanIntegration, Sampler
 from rigidfleet.simulation.point_propagator import PointPropagator
 from rigidfleet.simulation.recording import Piece, assemble_result
 from rigidfleet.simulation.sampled_propagator import FleetState, SampledPropagator
-from rigidfleet.simulation.sampling import Sampling, requested_times
+from rigidfleet.simulation.sampling import requested_times, times_between
 from rigidfleet.solids.records import join_solids
 from rigidfleet.typing import Floats
 
@@ -275,8 +275,9 @@ class Flight:
         self._built_in = controller is None and agent is None  # whether the mission's own laws fly
         self.external = ExternalForce(force, mission.n_agents) if force is not None else None
         self._push = External(self.external.address, float(max_step)) if self.external else External()  # fmt: skip
-        own_times = None if times is None else requested_times(times, mission.latest_end)
-        self.sampler = sampler or Sampling(mission.output_step, own_times).times_between
+        step = mission.output_step
+        wanted = step if times is None else requested_times(times, mission.latest_end)
+        self.sampler = sampler or partial(times_between, wanted)
         self.flips = flips
         self._reached = state_at_start(mission)
         self._vehicles = (
@@ -290,13 +291,11 @@ class Flight:
         self._ended: ActivePhase | None = (
             None  # the phase before, if its last state is not known yet
         )
-        self._t = 0.0  # end of the phase before [s]
         self._phases_begun: list[Phase] = []  # each phase as it was begun
         self._cut: set[int] = set()  # phases left before their end
         self._finished = False
         self._route = list(mission.phases)  # phases to fly; after a loss, those that it asks for
-        #: Whether nothing (more) follows from a loss or abort.
-        self._reacted = mission.abandons_at == math.inf
+        self._reacted = False  # to the loss or order that ends the plan
         self._following = 0  # index of the route's next phase
         self._answer = Answer([])  # what follows from it
         #: Of the phases begun, if the flight may have to leave them.
@@ -313,7 +312,9 @@ class Flight:
     @property
     def t(self) -> float:
         """Mission time reached [s]."""
-        return self._t if self._active is None else self._active.t
+        if self._active is None:
+            return self.phases[-1].t_end if self.phases else 0.0
+        return self._active.t
 
     @property
     def plan(self) -> PhasePlan:
@@ -730,7 +731,7 @@ class Flight:
         for method, counts in at.solves:
             self._solves.setdefault(method, type(counts)()).add(counts)
         self._ended = active
-        self._t = record.t_end = active.t
+        record.t_end = active.t
         at.raise_errors()  # those of a solver, at once
         if abandoned:
             points = () if record.target is None else record.target.get("through", ())

@@ -107,8 +107,8 @@ class Leader:
 
     def __post_init__(self) -> None:
         self.problem = self.plan.problem
+        #: Where the reference flown is another than the plan's.
         self.now: LeaderState | None = None
-        self.leads = False  # whether the reference flown is another than the plan's
         self.calm = True  # whether no barrier asks for more than the deviation's own decay
         n = max(1, round(_PERIOD / self.period))
         self.period *= n
@@ -132,12 +132,8 @@ class Leader:
             else self.deviation.decay_accelerations()
         )
         if self.clock.has_unit_rate and self.deviation.is_zero and not accelerations.any():
-            self.now = None
-            if not self.leads:
-                return None
-            self.leads = False
-            return postpone(self.problem, self.clock.delay)
-        self.leads = True
+            before, self.now = self.now, None
+            return None if before is None else postpone(self.problem, self.clock.delay)
         self.now = LeaderState(t, copy.copy(self.clock), self.deviation)
         problem = self._detour_problem(t, h, accelerations)
         lost = self.clock.advance_and_count_delay(h)

@@ -94,7 +94,7 @@ class OwnLaws:
         #: Length that the edge of each link is to have [m], and its rate [m/s]: (2, L).
         self.lengths = np.zeros((2, len(pairs)))
         #: The views last made, with their tick and problem: who looks before the flight asks has the same ones.
-        self.last: tuple[int, Problem, list[View | None]] | None = None
+        self.last: tuple[int, Problem | None, list[View | None]] = -1, None, []
         self.numbers = 0  # in the longest message
 
     def call_laws(
@@ -127,15 +127,14 @@ class OwnLaws:
 
     def has_current_views(self, problem: Problem, state: SampledState) -> bool:
         """Whether the views last made are those of the tick that comes."""
-        last = self.last
-        return last is not None and last[0] == state.count[TICKS] and last[1] is problem
+        return bool(self.last[0] == state.count[TICKS]) and self.last[1] is problem
 
     def views(
         self, phase: str, problem: Problem, w: Workspace, flight: SampledFlight, state: SampledState
     ) -> list[View | None]:
         """What each vehicle knows at the tick that comes, as the kernel has it ready; None for those that are lost."""
         k, mail = int(state.count[TICKS]), state.mail
-        if self.last is not None and self.has_current_views(problem, state):
+        if self.has_current_views(problem, state):
             return self.last[2]
         t, dt, g = k * self.tick, self.every * self.tick, problem.vehicles.g
         has_heard = mail.stamp >= 0

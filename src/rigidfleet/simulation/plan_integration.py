@@ -61,16 +61,16 @@ class PlanIntegration:
     counted: Ints = field(default_factory=lambda: np.zeros(3, dtype=np.int64))
     solves: list[tuple[str, Counts]] = field(default_factory=list)
 
-    def begin(self, y: Floats, t: float, states: int | None = None) -> None:
+    def begin(self, y: Floats, t: float, states: int, room: int) -> None:
         """Begin at a state (n,) and time [s]: at the start, and after a loss.
 
-        ``states``: how many the watch follows of vehicles; of points, it follows all.
+        The watch follows the first ``states``, in a trail with ``room`` for so many steps.
         """
         plan = self.plan
         self.workspace, self.solver = workspace_and_solver(plan, self.workspaces)
-        self.state = self.extremes.begin_monitoring(
-            y, t, len(plan.edges), rtol=plan.integrator.rtol, atol=plan.tolerances, states=states
-        )
+        trail = self.extremes.begin_monitoring(states, len(plan.edges), room)
+        rtol, atol = plan.integrator.rtol, plan.tolerances
+        self.state = records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
         self.begun = False
 
     @property

@@ -35,7 +35,6 @@ class Stretch(NamedTuple):
     times: Floats
     samples: Floats
     fresh: bool  # whether the derivative at the start is not known
-    first: float  # the first time after the start [s]
 
 
 class PointPropagator:
@@ -57,7 +56,7 @@ class PointPropagator:
     def begin(self, y: Floats, t: float) -> None:
         """Begin to integrate at a state (n,) and time [s]."""
         at = self.integration
-        at.begin(y, t)
+        at.begin(y, t, len(y), records.POINTS_TRAIL)
         self.known = None
         self.aside = at.plan.is_large and at.external is None
         if self.steps:  # after a loss
@@ -129,17 +128,30 @@ class PointPropagator:
         at.begun = True
         samples = np.empty((len(times), len(at.state.y)))
         at.state.count[records.SAMPLES] = 0
-        return Stretch(problem, times, samples, fresh, math.nextafter(at.t, math.inf))
+        return Stretch(problem, times, samples, fresh)
 
     def record_samples(self, stretch: Stretch) -> None:
         """Store the samples of what was integrated since `prepare_stretch`."""
-        state, (problem, times, samples, _, first) = self.integration.state, stretch
+        at, plan, state = self.integration, self.integration.plan, self.integration.state
+        problem, times, samples, _ = stretch
         done = int(state.count[records.SAMPLES])
         tried = state.count[records.EVALUATIONS] > 0 and state.count[records.ACCEPTED] == 0
-        if tried and len(times) and times[0] <= first:
+        if tried and len(times) and times[0] <= math.nextafter(at.t, math.inf):
             samples[0], done = state.y, 1  # no step was possible: record the start alone
-        if done:
-            self._store_samples(problem, times[:done], samples[:done])
+        if not done:
+            return
+        times, samples = times[:done], samples[:done]
+        n, m = len(plan.masses), len(plan.edges)
+        setup = None if at.solver is None else at.solver.setup
+        # Forces and references at the samples are evaluated when they are asked for.
+        source = Unevaluated(native.pack(problem), plan.problem, samples, setup)
+        if at.external is not None:  # a user's function is asked while it is at hand
+            source = source.evaluate(times, at.workspace)
+        frame = np.broadcast_to(np.nan, (len(times), 4))
+        if plan.frame is not None:
+            q = samples[:, 6 * n + m : 6 * n + m + 4]
+            frame = q / np.linalg.norm(q, axis=1, keepdims=True)
+        at.store_piece(times, source, samples[:, 6 * n : 6 * n + m], frame)
 
     def has_stalled(self) -> bool:
         """Whether the phase takes far more steps than its duration explains."""
@@ -167,17 +179,3 @@ class PointPropagator:
 
     def hand_over(self) -> None:
         """Leave nothing: all of points is in the state."""
-
-    def _store_samples(self, problem: Problem, times: Floats, samples: Floats) -> None:
-        """Store the samples; forces and references at them are evaluated when they are asked for."""
-        at, plan = self.integration, self.integration.plan
-        n, m = len(plan.masses), len(plan.edges)
-        setup = None if at.solver is None else at.solver.setup
-        source = Unevaluated(native.pack(problem), plan.problem, samples, setup)
-        if at.external is not None:  # a user's function is asked while it is at hand
-            source = source.evaluate(times, at.workspace)
-        frame = np.broadcast_to(np.nan, (len(times), 4))
-        if plan.frame is not None:
-            q = samples[:, 6 * n + m : 6 * n + m + 4]
-            frame = q / np.linalg.norm(q, axis=1, keepdims=True)
-        at.store_piece(times, source, samples[:, 6 * n : 6 * n + m], frame)

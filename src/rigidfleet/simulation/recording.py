@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -42,7 +42,6 @@ _WORK, _LEAST = 400_000_000, 9
 
 #: Columns of a record that are those of the phase, also where a user's controller flies.
 _REFERENCES = "r_ref", "p", "motion", "rates", "T_ref", "wrench"
-_STATES = "position", "velocity"
 #: Columns of a record that are those of edges.
 _EDGEWISE = "c", "L", "d", "d_dot", "multiplier"
 
@@ -140,15 +139,18 @@ class Piece:
     vehicles: VehicleSamples | None = None
     layers: LayerSamples | None = None
 
-    @cached_property
-    def forces_and_references(self) -> Record:
-        """Forces and references, of the edges of this phase."""
-        if not isinstance(self.source, Unevaluated):
-            return self.source
-        n = len(self.source.problem.vehicles.m)
-        out = new_record(len(self.time), n, len(self.edges))
-        self.record_into(native.pack_uncached(out), 0)
-        return out
+    @property
+    def r_and_v(self) -> tuple[Floats, Floats]:
+        """Positions and velocities (K, N, 3) of agents, world axes."""
+        if isinstance(self.source, Unevaluated):
+            return self.source.r_and_v
+        return self.source.r, self.source.v
+
+    @property
+    def record(self) -> Record:
+        """Forces and references, evaluated while it flew: for a user's force, and for vehicles."""
+        assert not isinstance(self.source, Unevaluated)
+        return self.source
 
     def record_into(
         self, out: native.Packed, first: int, make: Callable[..., Workspace] = workspace
@@ -185,8 +187,7 @@ def assemble_result(
 ) -> Result:
     """Join the pieces of a flight, of vehicles with a ``network`` and what was sent on it.
 
-    All that follows from positions and velocities is computed when it is first asked for, unless the law has already
-    been evaluated at the samples.
+    All that follows from positions and velocities is computed when it is first asked for.
     """
     pieces = [p for p in pieces if len(p.time)]
     counts = [len(p.time) for p in pieces]
@@ -200,18 +201,10 @@ def assemble_result(
     worst = [phase.extremes for phase in phases]
     names = *RECORDED, *(("disturbance_force",) if airy else ()), *(SEEN if noisy else ())
     recorded = partial(_forces_and_references, mission, pieces, time, flown)
-    states = [p.source.r_and_v for p in pieces if isinstance(p.source, Unevaluated)]
-    later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = []
-    if len(states) == len(pieces):
-        r, v = zip(*states, strict=True)
-        now = {"position": np.concatenate(r), "velocity": np.concatenate(v)}
-        later = [(names, recorded), (CLOSE, partial(closeness_arrays, mission, worst, r, time))]
-    else:
-        made = recorded()
-        now = {name: made[name] for name in (*_STATES, *names)}
-        r = np.split(now["position"], np.cumsum(counts)[:-1])
-        now |= closeness_arrays(mission, worst, r, time)
-    later += [
+    r, v = zip(*(p.r_and_v for p in pieces), strict=True)
+    later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = [
+        (names, recorded),
+        (CLOSE, partial(closeness_arrays, mission, worst, r, time)),
         (LATER, partial(_slot_references, mission, [(p.time, p.followed) for p in pieces], tau)),
         (("singular_value",), partial(_least_singular_value, r, [p.edges for p in pieces])),
         (("mission_text",), partial(mission_text_field, mission)),
@@ -233,8 +226,10 @@ def assemble_result(
         ending=ending,
         statistics=statistics,
         later=later,
+        position=np.concatenate(r),
+        velocity=np.concatenate(v),
         **({} if flown is None or network is None else _message_data(mission, flown.age, *network)),
-        **(_UNMADE | now),
+        **_UNMADE,
     )
 
 

@@ -39,7 +39,7 @@ from rigidfleet.simulation.leading import Leader, layers
 from rigidfleet.simulation.own_laws import Law, OwnLaws, View
 from rigidfleet.simulation.plan_integration import PlanIntegration
 from rigidfleet.simulation.recording import LayerSamples, VehicleSamples
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Floats, Ints
 
 #: Greatest number of ticks in a table, and of steps between two returns to Python.
 _TICKS, _STEPS = 1024, 4000
@@ -106,7 +106,6 @@ class SampledPropagator:
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
         if vehicles.avoidance is not None:
             vehicles.avoidance = avoidance.for_next_phase(vehicles.avoidance)
-        self.by_pieces = False  # whether the reference is given piece by piece
         self.steered = False  # whether it is given by hand
         self.decided_until = -math.inf  # end of what the leader has decided [s]
         self.flown: Problem | None = None  # the problem of the steps in the trail
@@ -127,7 +126,7 @@ class SampledPropagator:
         """Begin to fly at a state (n,) and time [s]; vehicles go on from the states that they have."""
         at, plan, fleet_state = self.integration, self.integration.plan, self.vehicles
         n, m = len(plan.masses), len(plan.edges)
-        at.begin(y, t, states=6 * n)
+        at.begin(y, t, 6 * n, records.VEHICLES_TRAIL)
         lost = self.flight.vehicles._replace(lost=plan.before.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
@@ -159,7 +158,7 @@ class SampledPropagator:
             self.gone = plan.before.lost.copy()  # (N,) vehicles that do not fly in this phase
             begun.peak_time[:] = begun.worst_time[:] = t
         self.tabled = None
-        self.steps_taken_over = int(begun.count[fleet.STEPS])  # those of the flight before
+        self.steps_before = int(begun.count[fleet.STEPS])  # those of the flight before
 
     # -- flying -----------------------------------------------------------------------------------
 
@@ -173,7 +172,6 @@ class SampledPropagator:
             self.decided_until = end
             if (problem := leader.lead(t, end, arrays)) is not None:
                 self._continue_with(problem)
-                self.by_pieces = leader.leads
         return self.decided_until
 
     @property
@@ -220,7 +218,6 @@ class SampledPropagator:
         if tables.yaw.kind == "along":
             now = tables.yaw_at(plan.problem, t, self.turn)
             self.turn = yaw_turn_from(problem, t, tables.yaw, now)
-        self.by_pieces = True
         plan.problem = problem
 
     def states_seen(self) -> dict[str, Floats]:
@@ -289,16 +286,13 @@ class SampledPropagator:
             if not -_FAR < points.min() <= points.max() < _FAR:  # NaN is not, either
                 rows = int((abs(points) < _FAR).all(axis=(1, 2)).argmin())
             at.state.count[records.TRAILED] = rows
-            extremes.monitor_paths(self.flown, at.workspace, at.state)
+            extremes.monitor_paths(self.flown, at.state)
             self.sampled.count[fleet.TRAILED] = at.state.count[records.TRAILED] = 0
             self.unjudged = True
         if last and self.unjudged:  # the rest is kept by the flight itself
             assert self.first_tick is not None  # it has begun
             ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
-            lost = at.plan.before.lost
-            extremes.take_vehicle_extremes(
-                self.sampled, self.flight.vehicles, self.gone, lost, ticks
-            )
+            extremes.take_vehicle_extremes(self.sampled, self.flight.vehicles, self.gone, ticks)
             self.unjudged = False
 
     def fly(self, problem: Problem, t_end: float) -> None:
@@ -345,7 +339,8 @@ class SampledPropagator:
             )
             done = done if finite.all() else int(finite.argmin())
             if done:
-                self._store_flown_samples(problem, call, done)
+                rows = {name: x[:done] for name, x in call._asdict().items() if np.ndim(x)}
+                self._store_flown_samples(problem, call._replace(**rows))
         if self.flight.clocks.own:
             self._postpone_plan_events()
         if not np.isfinite(sampled.S).all():
@@ -374,8 +369,10 @@ class SampledPropagator:
             before = source.switch_path(planned, tick, tables, tau)
         # A piece of a reference that is led holds until the next stop
         until = plan.t_end
-        if self.by_pieces:
-            until = min(until, self.decided_until if not self.steered else self.integration.stop)
+        if self.steered:
+            until = min(until, self.integration.stop)
+        elif self.leader is not None and self.leader.now is not None:
+            until = min(until, self.decided_until)
         last = min(tick + _TICKS, math.ceil(until * source.rate) + 1)
         made = source.tables_for(tick, max(last, tick + 1), planned, self.turn, tau)
         if before is not None:  # states that were measured about another path
@@ -393,10 +390,9 @@ class SampledPropagator:
         if plan.frame is not None:
             y[6 * n + m : 6 * n + m + 4] = sampled.frame[0]
         state.clock[records.TIME] = sampled.clock[fleet.TIME]
-        steps = int(sampled.count[fleet.STEPS]) - self.steps_taken_over
-        state.count[records.EVALUATIONS] += 4 * steps
-        state.count[records.ACCEPTED] += steps
-        self.steps_taken_over += steps
+        steps = int(sampled.count[fleet.STEPS]) - self.steps_before
+        state.count[records.EVALUATIONS] = 4 * steps
+        state.count[records.ACCEPTED] = steps
 
     def hand_over(self) -> None:
         """Leave the vehicles' states to the next phase, and so the workspace, to which these may refer."""
@@ -417,16 +413,16 @@ class SampledPropagator:
 
     # -- recording --------------------------------------------------------------------------------
 
-    def _store_flown_samples(self, problem: Problem, call: fleet.SampledSegment, done: int) -> None:
+    def _store_flown_samples(self, problem: Problem, call: fleet.SampledSegment) -> None:
         """Store samples: states and forces as flown, references and constraints of the plan."""
-        at, plan = self.integration, self.integration.plan
-        S, times = call.S[:done], call.times[:done]
-        parts = [S[..., :3].reshape(done, -1), S[..., 3:6].reshape(done, -1), call.integral[:done]]
+        at, plan, times, S = self.integration, self.integration.plan, call.times, call.S
+        done = len(times)
+        parts = [S[..., :3].reshape(done, -1), S[..., 3:6].reshape(done, -1), call.integral]
         frame = np.full((done, 4), np.nan)
         if plan.frame is not None:
-            frame = call.frame[:done]
+            frame = call.frame
             parts.append(frame)
-        tau, y = call.tau[:done], np.concatenate(parts, axis=1)
+        tau, y = call.tau, np.concatenate(parts, axis=1)
         if self.flight.clocks.own:
             planned = self._record_by_own_clocks(times, y, tau)
             plan_time = (times - self.vehicles.waited)[:, None, None] + tau[..., :1]
@@ -434,9 +430,9 @@ class SampledPropagator:
         else:
             planned = native.record(plan.problem, at.workspace, times, y)
             tau = tau[..., :0]
-        out, kept = _flown_record(planned, call, done, self.flight, problem, tau)
-        acting = self._avoidance_samples(call, done)
-        at.store_piece(times, out, call.integral[:done], frame, self.turn, kept, acting)
+        out, kept = self._flown_record(planned, call, problem, tau)
+        acting = self._avoidance_samples(times, call.layers)
+        at.store_piece(times, out, call.integral, frame, self.turn, kept, acting)
 
     def _record_by_own_clocks(self, times: Floats, y: Floats, tau: Floats) -> Record:
         """A record at the mean of own clocks ``tau`` (K, N, 3), with forces of now, and the slot by each clock."""
@@ -451,44 +447,35 @@ class SampledPropagator:
             np.multiply(x, rate[:, None], out=x)
         return planned
 
-    def _avoidance_samples(self, call: fleet.SampledSegment, done: int) -> LayerSamples | None:
-        """Samples of what avoidance did."""
+    def _avoidance_samples(self, times: Floats, acting: Ints) -> LayerSamples | None:
+        """Samples of what avoidance did at times (K,) [s], where these layers (K, N) acted."""
         if self.vehicles.avoidance is None:
             return None
-        times, acting = call.times[:done], call.layers[:done]
         if self.leader is None:
-            return LayerSamples(np.ones(done), np.zeros((done, 3)), acting)
+            return LayerSamples(np.ones(len(times)), np.zeros((len(times), 3)), acting)
         return LayerSamples(self.leader.clock_rate(times), self.leader.displacement(times), acting)
 
-
-def _flown_record(
-    planned: Record,
-    call: fleet.SampledSegment,
-    done: int,
-    flight: fleet.SampledFlight,
-    problem: Problem,
-    tau: Floats,
-) -> tuple[Record, VehicleSamples]:
-    """A record of references with the forces of vehicles, and the samples of the vehicles themselves."""
-    S, a, vehicles = call.S[:done], call.dS[:done, :, 3:6], flight.vehicles
-    curves = vehicles.thrust.T[..., None]
-    rotor = np.where(vehicles.point[:, None], 0.0, fleet.thrust_of(S[..., 13:], *curves))
-    T = att.dcm_from_quaternion(np.where(vehicles.point[:, None], [1.0, 0, 0, 0], S[..., 6:10]))
-    thrust = rotor.sum(axis=2)[..., None] * T[..., 2, :]
-    thrust = np.where(vehicles.point[:, None], call.command[:done, :, :3], thrust)
-    rest = vehicles.m[:, None] * a - thrust
-    air = rest + (vehicles.m * vehicles.g)[:, None] * np.array([0.0, 0.0, 1.0])
-    if problem.external.address:
-        air = air - (planned.f_E + (problem.vehicles.m * vehicles.g)[:, None] * [0.0, 0.0, 1.0])
-    seen = call.seen[:done]
-    out = planned._replace(
-        a=a, f_E=rest, f_D=air, f_u=call.f_u[:done], f_C=call.f_C[:done],
-        r_seen=seen[..., :3], v_seen=seen[..., 3:],
-    )  # fmt: skip
-    stamp = call.stamp[:done]
-    sent = np.where(stamp < 0, np.nan, flight.start + stamp * flight.steps * flight.h)
-    kept = VehicleSamples(
-        S[..., 6:10], S[..., 10:13], rotor, np.linalg.norm(thrust, axis=2), call.saturated[:done],
-        call.times[:done, None] - sent, tau,
-    )  # fmt: skip
-    return out, kept
+    def _flown_record(
+        self, planned: Record, call: fleet.SampledSegment, problem: Problem, tau: Floats
+    ) -> tuple[Record, VehicleSamples]:
+        """A record of references with the forces of vehicles, and the samples of the vehicles themselves."""
+        flight, S, a = self.flight, call.S, call.dS[:, :, 3:6]
+        vehicles = flight.vehicles
+        curves = vehicles.thrust.T[..., None]
+        rotor = np.where(vehicles.point[:, None], 0.0, fleet.thrust_of(S[..., 13:], *curves))
+        T = att.dcm_from_quaternion(np.where(vehicles.point[:, None], [1.0, 0, 0, 0], S[..., 6:10]))
+        thrust = rotor.sum(axis=2)[..., None] * T[..., 2, :]
+        thrust = np.where(vehicles.point[:, None], call.command[:, :, :3], thrust)
+        rest = vehicles.m[:, None] * a - thrust
+        air = rest + (vehicles.m * vehicles.g)[:, None] * np.array([0.0, 0.0, 1.0])
+        if problem.external.address:
+            air = air - (planned.f_E + (problem.vehicles.m * vehicles.g)[:, None] * [0.0, 0.0, 1.0])
+        out = planned._replace(
+            a=a, f_E=rest, f_D=air, f_u=call.f_u, f_C=call.f_C, r_seen=call.seen[..., :3], v_seen=call.seen[..., 3:]
+        )  # fmt: skip
+        sent = np.where(call.stamp < 0, np.nan, flight.start + call.stamp * flight.steps * flight.h)
+        kept = VehicleSamples(
+            S[..., 6:10], S[..., 10:13], rotor, np.linalg.norm(thrust, axis=2), call.saturated,
+            call.times[:, None] - sent, tau,
+        )  # fmt: skip
+        return out, kept

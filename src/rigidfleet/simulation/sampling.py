@@ -12,37 +12,32 @@ from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.typing import Floats
 
 
-class Sampling:
-    """The times to record: those given by the user, or multiples of a step and exact moments.
+def times_between(
+    wanted: Floats | float, plan: PhasePlan, t: float, t_end: float, *, first: bool, stop: float
+) -> Floats:
+    """Times in (t, t_end] [s] of a phase to record: those of the user, or multiples of a step [s] and exact moments.
 
-    Exact moments are ends of phases, arrivals, points to pass, losses and stops.
-    The start of a phase is recorded one representable number after the switch; so is the state after a loss.
+    Exact moments are ends of phases, arrivals, points to pass, losses, and ``stop``, where the caller stops. The start
+    of a phase, which is ``first`` after a switch, is recorded one representable number later; so is the state after a
+    loss.
     """
-
-    def __init__(self, step: float, times: Floats | None = None) -> None:
-        self.step, self.times = step, times
-
-    def times_between(
-        self, plan: PhasePlan, t: float, t_end: float, *, first: bool, stop: float = math.inf
-    ) -> Floats:
-        """Times in (t, t_end] [s] of a phase; ``first`` after a switch; ``stop`` is where the caller stops."""
-        if self.times is not None:
-            begin = 0 if first and t == 0.0 else self.times.searchsorted(t, "right")
-            return self.times[begin : self.times.searchsorted(t_end, "right")]
-        step, same = self.step, 1e-9 * self.step  # but for rounding
-        low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
-        grid = np.minimum(np.arange(low, high) * step, t_end)
-        losses = (*plan.lost_at.tolist(), *plan.links_lost[1].tolist()) if plan.loses else ()
-        passed = (at["time"] for at in plan.through)
-        for exact in dict.fromkeys((plan.arrival, plan.t_end, stop, *passed, *losses)):
-            if t < exact <= t_end:
-                # In the place of those that differ from it by rounding alone.
-                a, b = grid.searchsorted(exact - same), grid.searchsorted(exact + same, "right")
-                grid = np.concatenate([grid[:a], (exact,), grid[b:]])
-        if not first:
-            return grid
-        start = t if t == 0.0 else math.nextafter(t, math.inf)
-        return np.concatenate([(start,), grid[grid.searchsorted(start, "right") :]])
+    if isinstance(wanted, np.ndarray):
+        begin = 0 if first and t == 0.0 else wanted.searchsorted(t, "right")
+        return wanted[begin : wanted.searchsorted(t_end, "right")]
+    step, same = wanted, 1e-9 * wanted  # but for rounding
+    low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
+    grid = np.minimum(np.arange(low, high) * step, t_end)
+    losses = (*plan.lost_at.tolist(), *plan.links_lost[1].tolist()) if plan.loses else ()
+    passed = (at["time"] for at in plan.through)
+    for exact in dict.fromkeys((plan.arrival, plan.t_end, stop, *passed, *losses)):
+        if t < exact <= t_end:
+            # In the place of those that differ from it by rounding alone.
+            a, b = grid.searchsorted(exact - same), grid.searchsorted(exact + same, "right")
+            grid = np.concatenate([grid[:a], (exact,), grid[b:]])
+    if not first:
+        return grid
+    start = t if t == 0.0 else math.nextafter(t, math.inf)
+    return np.concatenate([(start,), grid[grid.searchsorted(start, "right") :]])
 
 
 def requested_times(times: ArrayLike, end: float) -> Floats:

@@ -33,7 +33,7 @@ from rigidfleet.math.piecewise import (
     stack_ways,
 )
 from rigidfleet.mission import Mission, as_mission
-from rigidfleet.result import Extremum, PhaseRecord, Result, presence
+from rigidfleet.result import LABELS, Extremum, PhaseRecord, Result, presence
 from rigidfleet.result.result import CLOSE, VARIABLES
 from rigidfleet.setpoints import interval_starts_and_knots
 from rigidfleet.simulation.extremes import CurveWatch
@@ -406,13 +406,6 @@ def _sample_times_states_and_yaw(curve: Piecewise, parts: Ints) -> tuple[Floats,
     return at, state, yaw
 
 
-def _split_intervals(time: Floats, parts: Ints) -> Floats:
-    """Knots (sum of the parts + 1,) [s] that cut each interval between times (K + 1,) into equal parts (K,)."""
-    k = np.repeat(np.arange(len(parts)), parts)
-    share = (np.arange(len(k)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[k]
-    return np.append(time[k] + np.diff(time)[k] * share, time[-1])
-
-
 def watch_curve(
     watch: CurveWatch, curve: Piecewise, grid: Floats, presence_spans: Sequence[Sequence[float]]
 ) -> dict[str, Extremum]:
@@ -439,7 +432,9 @@ def _watch_positions(
     knots = refine_knots(way.time, grid, 1e-6)
     k = piece_index(way.time, 0.5 * (knots[:-1] + knots[1:]))
     share = np.diff(knots) / np.diff(way.time)[k]
-    knots = _split_intervals(knots, np.ceil(_parts_a_piece(way)[k] * share - 1e-9).astype(np.int64))
+    parts = np.ceil(_parts_a_piece(way)[k] * share - 1e-9)
+    number = np.append(0.0, np.cumsum(parts))  # of the knots that remain
+    knots = np.interp(np.arange(number[-1] + 1.0), number, knots)  # equal parts of each interval
     together = max(1, _TOGETHER // (30 * way.pieces.shape[1]))
     here = presence(0.5 * (knots[:-1] + knots[1:]), spans, way.pieces.shape[1] if spans else 1)
     change = np.flatnonzero((here[1:] != here[:-1]).any(axis=1)) + 1
@@ -495,14 +490,8 @@ def result_of(
     time, r = known["time"], known["position"]
     k, n = r.shape[:2]
     left = presence(time, statistics["spans"], n)
-    sizes = {
-        "time": k,
-        "agent": n,
-        "axis": 3,
-        "quaternion": 4,
-        "wrench": 6,
-        "edge": len(known["edges"]),
-    }
+    sizes = {dim: len(names) for dim, names in LABELS.items()}
+    sizes |= {"time": k, "agent": n, "edge": len(known["edges"])}
     nothing = cache(lambda *shape: np.full(shape, np.nan))  # of each shape once
     unknown = {
         name: nothing(*(sizes[dim] for dim in x.dims))

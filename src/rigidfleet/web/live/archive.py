@@ -74,7 +74,7 @@ class Archive:
 
 def _count_values(piece: Piece) -> int:
     """Number of values in the record of a piece."""
-    return sum(x.size for x in piece.forces_and_references)
+    return sum(x.size for x in piece.record)
 
 
 def take_samples(piece: Piece, which: Bools | list[int]) -> Piece:
@@ -98,7 +98,7 @@ def _combine_arrays(pieces: Sequence[Piece], array: Callable[[Sequence[Any]], An
     names = "time", "integral", "frame", "vehicles", "layers"
     return replace(
         pieces[0],
-        source=combine([p.forces_and_references for p in pieces]),
+        source=combine([p.record for p in pieces]),
         followed=tuple(step for p in pieces for step in p.followed),
         **{name: combine([getattr(p, name) for p in pieces]) for name in names},
     )
