@@ -8,7 +8,6 @@ constraint law. Gusts and noise are left out: they have no mean.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from copy import copy
 from dataclasses import replace
 from functools import partial
 
@@ -142,11 +141,11 @@ def steady_offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Re
 
 def _planned_for_those_left(mission: Mission, planned: PlannedPhase) -> tuple[PlannedPhase, bool]:
     """A planned phase without those who are lost by its end, and whether none is lost on the way."""
-    leg, lost = copy(planned.leg), mission.lost_at < planned.leg.end
+    leg, lost = planned.leg, mission.lost_at < planned.leg.end
     if not lost.any():
         return planned, True
-    vars(leg).pop("certificate", None)
-    vars(leg).update(before=copy_with(leg.before, lost=lost))
+    leg = copy_with(leg, before=copy_with(leg.before, lost=lost))
+    vars(leg).pop("certificate", None)  # that is of all vehicles
     return replace(planned, leg=leg), bool((mission.lost_at[lost] <= leg.start).all())
 
 
