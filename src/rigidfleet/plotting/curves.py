@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, display_unit
+from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity
 from rigidfleet.math import attitude as att
 from rigidfleet.plotting import quadrotors
 from rigidfleet.plotting import style as st
@@ -399,7 +399,7 @@ def constraint_error(result: Result) -> Figure:
 def draw_least(ax: Axes, result: Result, name: str) -> None:
     """Least values, such as distances to others, to obstacles, or of falls to people, with their limit."""
     q, sampled = QUANTITIES[name], samples(result, name)
-    unit = display_unit(q.unit)
+    unit = q.display_unit
     ax.set_ylabel(f"{q.axis or q.name_in_words} [{unit}]")
     values, limit = getattr(result, name, sampled.worst), q.limit_of(result.mission) or 0.0
     values = np.where(np.isfinite(values), values, np.nan)

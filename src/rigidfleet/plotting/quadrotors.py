@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidfleet._common.quantities import QUANTITIES, display_unit
+from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.logged import true_runs
 from rigidfleet.plotting.peaks import Panel, distinct_limits
@@ -115,14 +115,14 @@ def vehicles(result: Result) -> Figure:
 def draw_with_limit(ax: Axes, result: Result, name: str, values: Floats | None = None) -> bool:
     """Draw each agent's values (K, N) of a quantity, their greatest and the limits; return whether there are any."""
     q, between = QUANTITIES[name], result.extreme(name)
-    ax.set_ylabel(f"{q.name_in_words.replace(' ', chr(10))} [{display_unit(q.unit)}]")
+    ax.set_ylabel(f"{q.name_in_words.replace(' ', chr(10))} [{q.display_unit}]")
     values = samples(result, name).values if values is None else values
     if not np.isfinite(values).any():
         st.mark_empty(ax, q.nothing)
         return False
     if between is not None:
         between = between._replace(value=q.scale * between.value, other=-1)
-    panel = Panel(ax, result, values, display_unit(q.unit), between)
+    panel = Panel(ax, result, values, q.display_unit, between)
     return panel.draw(distinct_limits(result.mission, q))
 
 

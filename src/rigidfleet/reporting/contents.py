@@ -12,7 +12,7 @@ import numpy as np
 
 from rigidfleet import plotting
 from rigidfleet._common.facts import Cell, FactTable, Level, Row, value
-from rigidfleet._common.quantities import QUANTITIES, display_unit, quantity
+from rigidfleet._common.quantities import QUANTITIES, quantity
 from rigidfleet._common.text import all_hold_in_words
 from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
@@ -264,7 +264,7 @@ def _number_comparison_table(
         ("failed checks", "", lambda _, v: float(sum(not f.passed for f in v.checks))),
         ("greatest waypoint miss", "m", partial(_worst_of, "waypoint_position")),
         ("mean thrust of a vehicle", "N", lambda r, _: _mean_thrust(r)),
-        *((q.text, display_unit(q.unit), partial(_worst_of, q.name)) for q in QUANTITIES.values()),
+        *((q.text, q.display_unit, partial(_worst_of, q.name)) for q in QUANTITIES.values()),
     ]
     rows = []
     for name, unit, measure in measures:
