@@ -391,9 +391,13 @@ def _stack_columns(columns: dict[str, Any], names: str) -> Floats:
     return np.column_stack([columns[name] for name in names.split()]).astype(np.float64)
 
 
+def swap_enu_and_ned(x: Floats) -> Floats:
+    """Vectors (..., 3) in east, north, up from north, east, down, or back."""
+    return x[..., [1, 0, 2]] * [1.0, 1.0, -1.0]
+
+
 def _turn_to_enu(x: Floats, frame: str) -> Floats:
-    """Vectors (K, 3) in east, north, up."""
-    return x if frame == "enu" else x[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    return x if frame == "enu" else swap_enu_and_ned(x)
 
 
 def _increasing_rows(time: Any, rows: Ints, notes: list[str]) -> Ints:

@@ -30,6 +30,8 @@ _CORNERS = np.kron(np.eye(3), [[1.0], [-1.0]]) + 0.0  # no -0.0
 _FACES = np.array(
     [[2, 4, 0], [2, 1, 4], [2, 5, 1], [2, 0, 5], [3, 0, 4], [3, 4, 1], [3, 1, 5], [3, 5, 0]]
 )
+#: Turns rows (..., 3) with z up to rows with y up; its transpose turns them back.
+_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
@@ -39,22 +41,23 @@ class _File:
     def __init__(self) -> None:
         self.data, self.views, self.accessors = bytearray(), [], []
 
-    def add_array(self, x: Floats | Ints, dtype: str = "<f4", *, bounds: bool = False) -> int:
+    def add_array(self, x: Floats | Ints, dtype: str = "<f4") -> int:
         """Add an array (K,) or (K, n) and return its number."""
         values = np.asarray(x, dtype=dtype)
         self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": values.nbytes})
         self.data += values.tobytes()
         each = 1 if values.ndim == 1 else values.shape[1]
-        described: dict[str, Any] = {
-            "bufferView": len(self.views) - 1,
-            "componentType": _FLOAT if dtype == "<f4" else _UNSIGNED,
-            "count": len(values),
-            "type": _TYPES[each],
-        }
-        if bounds:
-            low, high = (getattr(values.reshape(-1, each), f)(axis=0) for f in ("min", "max"))
-            described |= {"min": low.tolist(), "max": high.tolist()}
-        self.accessors.append(described)
+        rows = values.reshape(-1, each)
+        self.accessors.append(
+            {
+                "bufferView": len(self.views) - 1,
+                "componentType": _FLOAT if dtype == "<f4" else _UNSIGNED,
+                "count": len(values),
+                "type": _TYPES[each],
+                "min": rows.min(axis=0).tolist(),
+                "max": rows.max(axis=0).tolist(),
+            }
+        )
         return len(self.accessors) - 1
 
 
@@ -65,7 +68,7 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """
     file = _File()
     mesh = {
-        "attributes": {"POSITION": file.add_array(_CORNERS, bounds=True)},
+        "attributes": {"POSITION": file.add_array(_CORNERS)},
         "indices": file.add_array(_FACES.ravel(), "<u4"),
     }
     nodes, samplers, channels = [], [], []
@@ -77,7 +80,7 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
             ("translation", curve.time, _hermite_rows(curve), "CUBICSPLINE"),
             ("rotation", times, turned, "LINEAR"),
         ):
-            keys = {"input": file.add_array(time, bounds=True), "output": file.add_array(values)}
+            keys = {"input": file.add_array(time), "output": file.add_array(values)}
             samplers.append(keys | {"interpolation": way})
             channels.append({"sampler": len(samplers) - 1, "target": {"node": agent, "path": path}})
         nodes.append(
@@ -122,7 +125,7 @@ def _add_lights(scene: dict[str, Any], file: _File, motion: ExportedMotion) -> N
     scene["materials"] = [black | {"emissiveFactor": colour} for colour in colours]
     (shape,) = scene["meshes"][0]["primitives"]
     scene["meshes"] = [{"primitives": [shape | {"material": i}]} for i in range(n)]
-    keys = file.add_array(times - motion.start, bounds=True)
+    keys = file.add_array(times - motion.start)
     for i, node in enumerate(scene["nodes"]):
         node["mesh"] = i
         animation["samplers"].append({"input": keys, "output": file.add_array(shown[:, i])})
@@ -133,7 +136,7 @@ def _add_lights(scene: dict[str, Any], file: _File, motion: ExportedMotion) -> N
     far = float(np.linalg.norm(high - low)) / 2 / np.sin(_FOV / 2)
     right, up, back = lights.camera_axes(*lights.angles_facing_formation(result))
     axes = np.stack([right, up, back, (low + high) / 2 + far * back])
-    matrix = np.column_stack([_z_up_to_y_up(axes), [0.0, 0.0, 0.0, 1.0]]).ravel().tolist()
+    matrix = np.column_stack([axes @ _Y_UP, [0.0, 0.0, 0.0, 1.0]]).ravel().tolist()
     seen = {"yfov": _FOV, "znear": 0.01 * far, "zfar": 10 * far}
     scene["cameras"] = [{"type": "perspective", "perspective": seen}]
     scene["nodes"].append({"name": "front", "camera": 0, "matrix": matrix})
@@ -161,7 +164,7 @@ def read_gltf(data: bytes) -> list[Piecewise]:
             [array(animation["samplers"][channel["sampler"]][key]) for key in ("input", "output")]
             for channel in (moved, turned)
         )
-        before, at, after = (_y_up_to_z_up(x) for x in values.reshape(-1, 3, 3).swapaxes(0, 1))
+        before, at, after = (x @ _Y_UP.T for x in values.reshape(-1, 3, 3).swapaxes(0, 1))
         begin, end = np.stack([at[:-1], after[:-1]]), np.stack([at[1:], before[1:]])
         yaw = np.unwrap(2.0 * np.arctan2(quaternions[:, 1], quaternions[:, 3]))
         way = Piecewise.of_end_states(time[:, 0], begin, end)
@@ -174,12 +177,4 @@ def _hermite_rows(curve: Piecewise) -> Floats:
     begin, end = (x[..., :3].swapaxes(0, 1) for x in curve.piece_end_states(2))
     rows = np.zeros((len(curve.time), 3, 3))
     rows[1:, :2], rows[:-1, 1:] = end[:, ::-1], begin
-    return _z_up_to_y_up(rows.reshape(-1, 3))
-
-
-def _z_up_to_y_up(x: Floats) -> Floats:
-    return np.stack([x[..., 0], x[..., 2], -x[..., 1]], axis=-1)
-
-
-def _y_up_to_z_up(x: Floats) -> Floats:
-    return np.stack([x[..., 0], -x[..., 2], x[..., 1]], axis=-1)
+    return rows.reshape(-1, 3) @ _Y_UP

@@ -149,9 +149,7 @@ def blank_figure(wide: float, high: float, layout: Any = None) -> Figure:
     """An empty figure of a width and a height [in], which is drawn in our style."""
     from rigidfleet.plotting.figure import Figure
 
-    fig = Figure(figsize=(wide, high), layout=layout)
-    fig.settings = apply_style
-    return fig
+    return Figure(figsize=(wide, high), layout=layout)
 
 
 def time_figure(
