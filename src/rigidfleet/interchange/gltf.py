@@ -41,23 +41,22 @@ class _File:
     def __init__(self) -> None:
         self.data, self.views, self.accessors = bytearray(), [], []
 
-    def add_array(self, x: Floats | Ints, dtype: str = "<f4") -> int:
+    def add_array(self, x: Floats | Ints, dtype: str = "<f4", *, bounds: bool = False) -> int:
         """Add an array (K,) or (K, n) and return its number."""
         values = np.asarray(x, dtype=dtype)
         self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": values.nbytes})
         self.data += values.tobytes()
         each = 1 if values.ndim == 1 else values.shape[1]
-        rows = values.reshape(-1, each)
-        self.accessors.append(
-            {
-                "bufferView": len(self.views) - 1,
-                "componentType": _FLOAT if dtype == "<f4" else _UNSIGNED,
-                "count": len(values),
-                "type": _TYPES[each],
-                "min": rows.min(axis=0).tolist(),
-                "max": rows.max(axis=0).tolist(),
-            }
-        )
+        described: dict[str, Any] = {
+            "bufferView": len(self.views) - 1,
+            "componentType": _FLOAT if dtype == "<f4" else _UNSIGNED,
+            "count": len(values),
+            "type": _TYPES[each],
+        }
+        if bounds:
+            low, high = (getattr(values.reshape(-1, each), f)(axis=0) for f in ("min", "max"))
+            described |= {"min": low.tolist(), "max": high.tolist()}
+        self.accessors.append(described)
         return len(self.accessors) - 1
 
 
@@ -68,7 +67,7 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """
     file = _File()
     mesh = {
-        "attributes": {"POSITION": file.add_array(_CORNERS)},
+        "attributes": {"POSITION": file.add_array(_CORNERS, bounds=True)},
         "indices": file.add_array(_FACES.ravel(), "<u4"),
     }
     nodes, samplers, channels = [], [], []
@@ -80,7 +79,7 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
             ("translation", curve.time, _hermite_rows(curve), "CUBICSPLINE"),
             ("rotation", times, turned, "LINEAR"),
         ):
-            keys = {"input": file.add_array(time), "output": file.add_array(values)}
+            keys = {"input": file.add_array(time, bounds=True), "output": file.add_array(values)}
             samplers.append(keys | {"interpolation": way})
             channels.append({"sampler": len(samplers) - 1, "target": {"node": agent, "path": path}})
         nodes.append(
@@ -125,7 +124,7 @@ def _add_lights(scene: dict[str, Any], file: _File, motion: ExportedMotion) -> N
     scene["materials"] = [black | {"emissiveFactor": colour} for colour in colours]
     (shape,) = scene["meshes"][0]["primitives"]
     scene["meshes"] = [{"primitives": [shape | {"material": i}]} for i in range(n)]
-    keys = file.add_array(times - motion.start)
+    keys = file.add_array(times - motion.start, bounds=True)
     for i, node in enumerate(scene["nodes"]):
         node["mesh"] = i
         animation["samplers"].append({"input": keys, "output": file.add_array(shown[:, i])})

@@ -53,7 +53,7 @@ def write_tlog_of_each_vehicle(motion: ExportedMotion, rate: float | None) -> It
         off = 1e3 * (float(motion.result.motors_off[agent]) - motion.start)
         flies, system = every <= off, agent % _SYSTEMS + 1
         milliseconds = every[flies]
-        fields = np.zeros(len(milliseconds), dtype=_FIELDS)
+        fields: Any = np.zeros(len(milliseconds), dtype=_FIELDS)
         fields["time_boot_ms"] = milliseconds
         fields["state"] = swap_enu_and_ned(setpoints.state[flies, :3, 0])
         fields["yaw"] = (np.pi / 2 - setpoints.yaw[flies, 0] + np.pi) % (2.0 * np.pi) - np.pi
