@@ -650,6 +650,27 @@ def test_one_wrong_time_of_receipt_moves_no_clock(tmp_path):
     np.testing.assert_allclose(time + read.since, 1.7e9 + 0.02 * np.arange(100), atol=1e-6)
 
 
+def test_what_is_lost_behind_damage_of_a_ulog_is_told(tmp_path):
+    """Bytes that are inserted or lost within a log are noted, also where its library ends there in silence."""
+    pytest.importorskip("pyulog")
+    data = ulog(
+        tmp_path / "one.ulg", [("vehicle_local_position", 0, LOCAL, list(local_rows(valid=0)))]
+    ).read_bytes()
+    assert not said(read_trajectories(tmp_path / "one.ulg"), "damaged")
+    random, lost = np.random.default_rng(8), 0
+    for k in range(30):
+        at = len(data) // 3 + 61 * k
+        noise = random.integers(0, 256, 200).astype(np.uint8).tobytes()
+        bad = data[:at] + noise + data[at:] if k % 2 else data[:at] + data[at + 150 :]
+        (tmp_path / "one.ulg").write_bytes(bad)
+        with suppress(TrajectoryError):
+            read = read_trajectories(tmp_path / "one.ulg", gaps="bridge")
+            short = len(read.curves[0].time) < 95
+            lost += short
+            assert not short or said(read, "damaged")
+    assert lost > 3
+
+
 def test_a_ulog_is_cut(tmp_path):
     """A log whose end is missing is read up to there; one without its head is one error."""
     pytest.importorskip("pyulog")

@@ -18,6 +18,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, redirect_stderr, redirect_stdout
 from fnmatch import fnmatchcase
 from importlib.util import find_spec
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,6 +47,8 @@ _EARLY = 10 * 10**9
 _LISTED, FAR = 3, 1e9
 #: How files begin; notes on what is damaged, and on whose clock dates are of.
 ULOG, BIN = b"ULog\x01\x12\x35", b"\xa3\x95"
+#: Bytes before the first message of a ULog, and the kinds of its messages (PX4's guide: ULog file format).
+_ULOG_HEAD, _ULOG_KINDS = 16, frozenset(b"BFIMPQARDLCSO")
 DAMAGED = "the log is damaged in part: what could be read is judged"
 GNSS = "that of the receiver of GNSS, true to its delay of some tenths of a second"
 
@@ -453,12 +456,23 @@ def _read_ulog(path: Path) -> Log:
         channels.append(channel_of_px4(topic, x.name, x.data, after))
         if x.name == "actuator_armed":
             armed = channels.pop().columns["time"], x.data["armed"]
-    notes = [DAMAGED] * log.file_corruption
+    notes = [DAMAGED] * (log.file_corruption or _has_unknown_message(path))
     if lost := [x.duration / 1e3 for x in log.dropouts]:
         words = f"{sum(lost):.3g} s in all, at most {max(lost):.3g} s"
         notes.append(f"the logger lost data {len(lost):,} times, {words}")
     clock = GNSS if after else "the dates that the vehicle had" if dated else ""
     return Log({"": channels}, clock, armed, tuple(notes))
+
+
+def _has_unknown_message(path: Path) -> bool:
+    """Whether a ULog has a message of no known kind, where pyulog may stop as at the end of a log."""
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        at = _ULOG_HEAD
+        while at + 3 <= len(data):
+            if data[at + 2] not in _ULOG_KINDS:
+                return True
+            at += 3 + int.from_bytes(data[at : at + 2], "little")
+    return False
 
 
 def channel_of_px4(topic: str, message: str, data: dict[str, Any], after: int = 0) -> Channel:
