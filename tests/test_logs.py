@@ -521,6 +521,156 @@ def test_origins_of_several_logs_are_one(tmp_path):
     )
 
 
+#: Where an origin is moved to by `moved_rows`, and how far north of the first one that is [m].
+ORIGINS = ((47.4, 8.55, 488.0), (47.401, 8.55, 488.0))
+NORTH = float(flat(*np.array(ORIGINS[1:]).T, ORIGINS[0])[0, 1])
+
+
+def moved_rows(n=100):
+    """Microseconds, north, east, down [m] and origin of a vehicle that flies north while its origin moves, at 50."""
+    for k in range(n):
+        yield 5_000_000 + 20_000 * k, 0.02 * k - NORTH * (k >= 50), 1.0, -3.0, ORIGINS[k >= 50]
+
+
+def at_first_origin(path: Path):
+    return at_samples(read_trajectories(path, origin=ORIGINS[0]))[1]
+
+
+FLOWN = np.stack([np.ones(100), 0.02 * np.arange(100), np.full(100, 3.0)], 1)
+
+
+def test_an_origin_that_moves_counts_from_then_on(tmp_path):
+    """Local positions of PX4, MAVLink and ArduPilot are about the origin that was stated last."""
+    pytest.importorskip("pyulog")
+    rows = [
+        (t, t, x, y, z, 0, 0, 0, 0, 0.1, 0.1, *at, 0, True, True) for t, x, y, z, at in moved_rows()
+    ]
+    path = ulog(tmp_path / "one.ulg", [("vehicle_local_position", 0, LOCAL, rows)])
+    np.testing.assert_allclose(at_first_origin(path), FLOWN, atol=5e-3)
+    messages = []
+    for k, (t, x, y, z, (lat, lon, height)) in enumerate(moved_rows()):
+        if k in (0, 50):
+            place = round(1e7 * lat), round(1e7 * lon), round(1e3 * height)
+            messages.append((1_700_000_000_000_000 + t, 1, 1, "gps_global_origin", place))
+        messages.append(
+            (1_700_000_000_000_000 + t, 1, 1, "local_position_ned", (t // 1000, x, y, z, 0, 0, 0))
+        )
+    path = telemetry(tmp_path / "one.tlog", messages)
+    np.testing.assert_allclose(at_first_origin(path), FLOWN, atol=5e-3)
+    parts = []
+    for k, (t, x, y, z, (lat, lon, height)) in enumerate(moved_rows()):
+        if k in (0, 50):
+            parts.append(("ORGN", (t, 0, round(1e7 * lat), round(1e7 * lon), round(1e2 * height))))
+        parts.append(("XKF1", (t, 0, 0.0, 0.0, 0.0, x, y, z, 0)))
+    path = dataflash(tmp_path / "one.bin", parts)
+    np.testing.assert_allclose(at_first_origin(path), FLOWN, atol=5e-3)
+    assert rows_of(path, "ORGN", "Lat").tolist() == [[47.4], [47.401]]
+
+
+#: Messages of ArduPilot: number, format and fields, after `LogStructure.h`; and how Python packs the format.
+DATAFLASH = {
+    "XKF1": (10, "QBffffffc", "TimeUS,C,VN,VE,VD,PN,PE,PD,Yaw"), "ORGN": (11, "QBLLe", "TimeUS,Type,Lat,Lng,Alt"),
+    "XKF4": (12, "QBB", "TimeUS,C,PI"),
+}  # fmt: skip
+PACKS = {"Q": "Q", "B": "B", "f": "f", "c": "h", "L": "i", "e": "i"}
+
+
+def dataflash(path: Path, messages) -> Path:
+    """A log of ArduPilot, of messages with their values."""
+    codes = {name: "<" + "".join(PACKS[kind] for kind in own[1]) for name, own in DATAFLASH.items()}
+    form = lambda *x: b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", *x)  # noqa: E731
+    parts = [form(128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")]
+    for name, (number, kinds, fields) in DATAFLASH.items():
+        size = 3 + struct.calcsize(codes[name])
+        parts.append(form(number, size, name.encode(), kinds.encode(), fields.encode()))
+    for name, values in messages:
+        parts.append(b"\xa3\x95" + bytes([DATAFLASH[name][0]]) + struct.pack(codes[name], *values))
+    path.write_bytes(b"".join(parts))
+    return path
+
+
+def test_a_core_that_was_not_trusted_is_told(tmp_path):
+    """Positions are of the core that the estimator trusted most; for how long it trusted another one is noted."""
+    pytest.importorskip("pymavlink")
+    parts = []
+    for k in range(100):
+        t = 1_000_000 + 20_000 * k
+        parts += [("XKF1", (t, core, 0, 0, 0, 0.02 * k, 1.0 + core, -3.0, 0)) for core in (0, 1)]
+        parts.append(("XKF4", (t, 0, int(k >= 80))))
+    read = read_trajectories(dataflash(tmp_path / "one.bin", parts))
+    np.testing.assert_allclose(at_samples(read)[1], FLOWN, atol=1e-6)
+    assert said(read, "in 20 % of the log, the estimator trusted another core than XKF1:0")
+
+
+def test_a_message_of_which_little_is_valid_gives_way_to_another(tmp_path):
+    """Of two messages the one counts that has samples; a clock that stands still has none; a name is a choice."""
+    pytest.importorskip("pyulog")
+    few = list(local_rows(valid=97))
+    earth = [("uint64_t", "timestamp"), ("double", "lat"), ("double", "lon"), ("float", "alt")]
+    rows = [(5_000_000 + 20_000 * k, 47.4 + 1e-7 * k, 8.55, 488.0) for k in range(100)]
+    topics = [
+        ("vehicle_local_position", 0, LOCAL, few),
+        ("vehicle_global_position", 0, earth, rows),
+    ]
+    path = ulog(tmp_path / "one.ulg", topics)
+    read = read_trajectories(path)
+    assert said(read, "positions are those of vehicle_global_position")
+    assert said(read, "vehicle_local_position: of its samples, only 3 are valid and in order")
+    named = read_trajectories(path, topic="vehicle_local_position")
+    assert len(named.curves[0].time) == 3
+    still = [(t, 4_000_000, *more) for t, _, *more in local_rows(valid=0)]
+    path = ulog(tmp_path / "one.ulg", [("vehicle_local_position", 0, LOCAL, still)])
+    with pytest.raises(TrajectoryError, match="of its samples, only 1 are valid and in order"):
+        read_trajectories(path)
+
+
+def test_a_position_that_nothing_reaches_is_none(tmp_path):
+    """What damage makes of a number is left out, as nan is."""
+    pytest.importorskip("pyulog")
+    rows = [
+        (*row[:2], 1e30 if k == 50 else row[2], *row[3:])
+        for k, row in enumerate(local_rows(valid=0))
+    ]
+    read = read_trajectories(
+        ulog(tmp_path / "one.ulg", [("vehicle_local_position", 0, LOCAL, rows)])
+    )
+    assert len(read.curves[0].time) == 99
+    assert said(read, "1 samples without a valid position are left out")
+
+
+def test_one_wrong_time_of_receipt_moves_no_clock(tmp_path):
+    """The delay of the quickest message counts, but for one that would have come long before it was sent."""
+    rows = [
+        (1_700_000_000_000_000 + 20_000 * k - 10**12 * (k == 40), 1, 1, "local_position_ned",
+         (1000 + 20 * k, 0.02 * k, 1, -3, 0, 0, 0)) for k in range(100)
+    ]  # fmt: skip
+    read = read_trajectories(telemetry(tmp_path / "one.tlog", rows))
+    time, place = at_samples(read)
+    np.testing.assert_allclose(place, FLOWN, atol=1e-6)
+    np.testing.assert_allclose(time + read.since, 1.7e9 + 0.02 * np.arange(100), atol=1e-6)
+
+
+def test_what_is_lost_behind_damage_of_a_ulog_is_told(tmp_path):
+    """Bytes that are inserted or lost within a log are noted, also where its library ends there in silence."""
+    pytest.importorskip("pyulog")
+    data = ulog(
+        tmp_path / "one.ulg", [("vehicle_local_position", 0, LOCAL, list(local_rows(valid=0)))]
+    ).read_bytes()
+    assert not said(read_trajectories(tmp_path / "one.ulg"), "damaged")
+    random, lost = np.random.default_rng(8), 0
+    for k in range(30):
+        at = len(data) // 3 + 61 * k
+        noise = random.integers(0, 256, 200).astype(np.uint8).tobytes()
+        bad = data[:at] + noise + data[at:] if k % 2 else data[:at] + data[at + 150 :]
+        (tmp_path / "one.ulg").write_bytes(bad)
+        with suppress(TrajectoryError):
+            read = read_trajectories(tmp_path / "one.ulg", gaps="bridge")
+            short = len(read.curves[0].time) < 95
+            lost += short
+            assert not short or said(read, "damaged")
+    assert lost > 3
+
+
 def test_a_ulog_is_cut(tmp_path):
     """A log whose end is missing is read up to there; one without its head is one error."""
     pytest.importorskip("pyulog")
@@ -948,6 +1098,60 @@ def test_a_recording_that_ends_with_the_power(log):
     path.write_bytes(path.read_bytes()[:60])
     with pytest.raises(TrajectoryError, match="the recording is damaged"):
         read_trajectories(path)
+
+
+def test_bytes_that_changed_in_an_mcap_are_noticed(tmp_path):
+    """Checksums of chunks and of all data are compared, as the format's own writer sets them."""
+    writer = pytest.importorskip("mcap.writer")
+    for compression in ("NONE", "ZSTD"):
+        path = tmp_path / f"{compression}.mcap"
+        with path.open("wb") as file:
+            own = writer.Writer(
+                file, compression=writer.CompressionType[compression], chunk_size=2000
+            )
+            own.start(profile="ros2")
+            schema = own.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", b"")
+            to = own.register_channel("/a", "cdr", schema)
+            for k in range(200):
+                t = 10**18 + 20_000_000 * k
+                head = struct.pack("<4siII4s", b"\0\1\0\0", t // 10**9, t % 10**9, 4, b"map\0")
+                own.add_message(to, t, head + struct.pack("<7d", k, 1.0, 2.0, 0, 0, 0, 1), t)
+            own.finish()
+        data = path.read_bytes()
+        read = read_trajectories(path)
+        assert len(read.curves[0].time) == 200
+        assert not said(read, "damaged")
+        begin = data.index(b"map\0") if compression == "NONE" else len(data) // 3
+        for k in range(40):
+            at = begin + 7 * k + len(data) // 4 * (k % 2)
+            path.write_bytes(data[:at] + bytes([data[at] ^ 0x40]) + data[at + 1 :])
+            try:
+                read = read_trajectories(path, gaps="bridge")
+            except TrajectoryError as error:
+                assert "damaged" in str(error)  # noqa: PT017
+                continue
+            x = at_samples(read)[1][:, 0]
+            assert said(read, "damaged") or np.array_equal(x, np.arange(200))
+            np.testing.assert_array_equal(x, np.arange(len(x)))
+
+
+def test_messages_of_other_packages_are_not_those_of_ros(tmp_path):
+    """A message with a known name and other fields is refused by its name, not read as what it is not."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kind = "acme_msgs/msg/PoseStamped"
+    store.register(get_types_from_msg("std_msgs/Header header\nfloat32[40] x", kind))
+    header, time = (store.types[x] for x in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time"))
+    with rosbag2.Writer(tmp_path / "bag", version=9) as writer:
+        to = writer.add_connection("/pose", kind, typestore=store)
+        for k in range(20):
+            stamp = header(time(10, 20_000_000 * k), "map")
+            message = store.types[kind](stamp, np.arange(40, dtype=np.float32))
+            writer.write(to, 10**10 + 20_000_000 * k, store.serialize_cdr(message, kind))
+    with pytest.raises(TrajectoryError, match=f"/pose: has messages of {kind}, whose fields are"):
+        read_trajectories(tmp_path / "bag")
 
 
 #: How `px4_msgs` defines the first fields of two messages, and the last ones that matter here.

@@ -415,3 +415,12 @@ def test_a_show_of_fewer_points_than_vehicles(tmp_path, monkeypatch, capsys):
     mission = load_mission(tmp_path / "s.toml")
     assert written_slots(mission, "logo").shape == (16, 3)
     assert assess(simulate(mission)).passed
+
+
+@pytest.mark.parametrize(("suffix", "what"), [("pcd", "PCL"), ("obj", "Wavefront"), ("DXF", "CAD")])
+def test_points_of_other_programs_are_refused_by_name(suffix, what, tmp_path):
+    """What it is, and what to give instead."""
+    path = tmp_path / f"logo.{suffix}"
+    path.write_text("v 0 0 0\nv 1 0 0\n")
+    with pytest.raises(MissionError, match=rf"{what}\s+save.* as (PLY|SVG)"):
+        read_points(path)

@@ -167,10 +167,11 @@ def test_a_check_lists_the_planned_motion_with_its_limit(key):
     assert limit == check.limit < worst
     assert worst == pytest.approx(check.worst, rel=0.1)  # as it is flown, but for errors of control
     (row,) = [words for heading, words in before.describe() if heading == q.name_in_words]
-    assert f"limit <= {limit:g} {q.unit}," in row
+    shown = q.unit.replace("^2", "²").replace("^3", "³")
+    assert f"limit <= {limit:g} {shown}," in row
     cells = re.findall(r"<td[^>]*>([^<]*)</td>", before._repr_html_())
     k = cells.index(q.name_in_words)
-    assert cells[k + 2] == f"&lt;= {limit:g} {q.unit}"
+    assert cells[k + 2] == f"&lt;= {limit:g} {shown}"
 
 
 def test_a_check_lists_the_separation_with_its_limit():

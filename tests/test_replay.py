@@ -253,7 +253,7 @@ def test_tension_scale(share, tension, beyond):
 
 def test_too_many_edges(monkeypatch):
     """Of too many edges the shortest are drawn, and the page says so."""
-    monkeypatch.setattr(import_module("rigidfleet.web.replay"), "_EDGES", 10)
+    monkeypatch.setattr(import_module("rigidfleet.web.replay"), "EDGES", 10)
     info, columns = parts(replay_page(EIGHT))
     assert len(info["edges"]) == columns["tension"].shape[1] == 10
     assert "10 shortest of 17 edges" in info["note"]

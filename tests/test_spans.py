@@ -698,3 +698,26 @@ def test_drones_of_a_show_keep_their_times_when_flown(tmp_path):
     np.testing.assert_allclose(
         phase.pieces.at(np.array([2.0, 5.0, 7.0]))[:, :, 2], [[7, 5], [9, 7], [9, 9]]
     )
+
+
+@pytest.mark.parametrize("number", [9999.0, -1.0, 77.0])
+@pytest.mark.parametrize("unit", ["m", "mm"])
+def test_a_number_that_stands_for_no_position_is_refused(tmp_path, number, unit):
+    """One number for x, y and z, to which positions leap and from which they come back, is no place; nan is none."""
+    header, scale = f"time_s,x_{unit},y_{unit},z_{unit}", {"m": 1.0, "mm": 1e3}[unit]
+    lost = (EVERY > 3) & (EVERY < 3.25)
+    place = scale * np.stack([0.2 * EVERY - 5.0, 2.0 + 0.0 * EVERY, 3.0 + 0.0 * EVERY], 1)
+    for missing, axes in ((number, None), (number, "ned"), (np.nan, None)):
+        rows = np.column_stack([EVERY, np.where(lost[:, None], missing, place)])
+        np.savetxt(tmp_path / "t.csv", rows, delimiter=",", header=header, comments="")
+        if np.isnan(missing):
+            read_trajectories(tmp_path / "t.csv", axes=axes)
+            continue
+        with pytest.raises(TrajectoryError, match=r"'t' leaps to a place .* as if it had none"):
+            read_trajectories(tmp_path / "t.csv", axes=axes)
+    # Who flies along the diagonal, ever faster, or stands there, is somewhere.
+    there = np.repeat(np.cumsum(np.linspace(0.0, 1.0, len(EVERY)))[:, None], 3, axis=1)
+    for at in (there, 0 * there + 77.0):
+        rows = np.column_stack([EVERY, at])
+        np.savetxt(tmp_path / "t.csv", rows, delimiter=",", header=header, comments="")
+        read_trajectories(tmp_path / "t.csv")

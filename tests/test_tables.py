@@ -1013,3 +1013,52 @@ def test_repeated_points_of_meshes_are_left_out(tmp_path, monkeypatch, capsys):
     assert len(read_points("out.csv").slots) == 8
     assert main(["design", "box.csv", "--agents", "5", "--edges", "none", "--out", "five.csv"]) == 0
     assert len(read_points("five.csv").slots) == 5
+
+
+#: What `rostopic echo -p` prints of messages with a header, after its source: when one came, its fields in order.
+POSE = ["header.seq", "header.stamp", "header.frame_id", *(f"pose.position.{x}" for x in "xyz"),
+        *(f"pose.orientation.{x}" for x in "xyzw")]  # fmt: skip
+
+
+@pytest.mark.parametrize("since", [0, 1_700_000_000])
+@pytest.mark.parametrize("header", [True, False])
+def test_what_rostopic_prints_is_in_nanoseconds(since, header, tmp_path):
+    """The stamp of a message counts, not when it came, in simulated time, too; without a header the other is there."""
+    names = POSE if header else [*"xyz"]
+    lines = [",".join(["%time", *(f"field.{name}" for name in names)])]
+    for k in range(50):
+        stamp, place = since * 10**9 + 5_000_000_000 + 20_000_000 * k, [0.01 * k, 1, 2]
+        came = stamp + 1_000_000 * (k % 7)
+        row = [came, k, stamp, "map", *place, 0, 0, 0, 1] if header else [stamp, *place]
+        lines.append(",".join(map(str, row)))
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    read = read_trajectories(tmp_path / "t.csv")
+    (curve,) = read.curves
+    np.testing.assert_allclose(curve.time + read.since, since + 5 + 0.02 * np.arange(50), atol=1e-6)
+    np.testing.assert_allclose(curve.at(curve.time)[:, 0], 0.01 * np.arange(50))
+
+
+@pytest.mark.parametrize(
+    ("program", "head"),
+    [
+        ("Motive", "Format Version,1.23,Take Name,a\n\n,Type,Rigid Body\n"),
+        ("Vicon", "Objects\n100\n,,cf1:cf1,,\nFrame,Sub Frame,RX,RY,RZ,TX,TY,TZ\n"),
+        ("Vicon", "Trajectories\r\n100\r\n,,cf1:1,,\r\nFrame,Sub Frame,X,Y,Z\r\n"),
+    ],
+)
+def test_exports_of_motion_capture_are_refused_by_name(program, head, tmp_path, capsys):
+    """With a line of names that is read as it is meant."""
+    path = tmp_path / "t.csv"
+    path.write_text(head + "".join(f"{k},0,0,0,0,{k},0,1000\n" for k in range(20)))
+    assert main(["assess", str(path)]) == BAD_INPUT
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"is an export of {program}" in said
+    names = said.partition("such as ")[2].split()[0]
+    assert names.split(",")[1:4] == ["cf1_x_mm", "cf1_y_mm", "cf1_z_mm"]
+    whole = f"{names},cf2_y_mm,cf2_z_mm\n" + "".join(
+        f"{k / 10},{k},2000,0,{k},2000,500\n" for k in range(20)
+    )
+    path.write_text(whole)
+    read = read_trajectories(path, axes="eus")
+    assert read.names == ("cf1", "cf2")
+    np.testing.assert_allclose(read.curves[1].at(np.array([1.0]))[0, :3], [0.01, -0.5, 2.0])

@@ -85,7 +85,7 @@ def test_a_regulators_way_jumps():
     mission = changed("passage-quadrotors", smoothness="lqr")
     found = rf.check(mission, search=False)
     (remark,) = (r for r in found.remarks if r.topic == "jumps")
-    assert "jumps by 2.47 m/s^2 (14.1 deg of tilt) at 65.00 s" in remark.text
+    assert "jumps by 2.47 m/s² (14.1 deg of tilt) at 65.00 s" in remark.text
     x = rf.simulate(mission).extreme("saturation")
     assert x is not None
     assert x.value > 0.01

@@ -30,11 +30,16 @@ _MANY = 7
 _LOOK = ' style="text-align:left;vertical-align:top;padding:2px 14px 2px 0"'
 
 
+def display_unit(unit: str) -> str:
+    """A unit as consoles, pages and figures show it: m/s² for m/s^2, as data and missions write it."""
+    return unit.replace("^2", "²").replace("^3", "³")
+
+
 def value(x: float, unit: str = "") -> str:
     """A number to three digits, with its unit."""
     whole = 999.5 <= abs(x) < 1e5
     number = f"{x:.0f}" if whole else f"{x:.3g}" if x == 0 or 1e-3 <= abs(x) < 1e5 else f"{x:.1e}"
-    return f"{number} {unit}".rstrip()
+    return f"{number} {display_unit(unit)}".rstrip()
 
 
 class Cell(NamedTuple):

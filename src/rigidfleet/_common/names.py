@@ -190,6 +190,11 @@ def meanings_of(names: Sequence[str]) -> list[ColumnMeaning]:
         for k, q in enumerate(kinds):
             if q.kind == "time" and "stamp" in names[k].lower():
                 kinds[k] = q._replace(unit=q.unit or "ms")
+    if [name for name in names if not name.startswith("field")] == ["time"]:
+        # `rostopic echo -p`: when a message came, and its stamp, which counts; both in nanoseconds (`_str_plot`).
+        for k, q in enumerate(kinds):
+            came = "field.header.stamp" in names and names[k] == "time"
+            kinds[k] = q._replace(kind="" if came else q.kind, unit="ns") if q.kind == "time" else q
     known, place = {q.kind for q in kinds}, {name.lower(): k for k, name in enumerate(names)}
     alike: dict[str, dict[str, tuple[list[int], str]]] = {}
     for name in place:

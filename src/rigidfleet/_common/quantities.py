@@ -13,6 +13,8 @@ from math import degrees, inf
 from operator import attrgetter
 from typing import Any, Literal
 
+from rigidfleet._common.facts import display_unit
+
 #: What has one value each: an agent, two agents, an edge, an agent beside one of the `PLACES`, the formation.
 Who = Literal["agent", "pair", "edge", "obstacle", "fence", "people", "formation"]
 #: Tables of a mission in which the things stand beside which an agent has a value.
@@ -79,6 +81,11 @@ class Quantity:
         return self.sense == "least"
 
     @property
+    def display_unit(self) -> str:
+        """The unit as consoles, pages and figures show it."""
+        return display_unit(self.unit)
+
+    @property
     def of_edges(self) -> bool:
         """Whether it says nothing of a flight without edges."""
         return self.source.endswith("edges")
@@ -93,7 +100,7 @@ class Quantity:
         """A worst value, with its unit, in words."""
         if self.words:
             return self.words.format(worst=worst, who=who, when=when, limit=limit)
-        bound = "" if limit is None else f" (limit {limit:g} {self.unit})"
+        bound = "" if limit is None else f" (limit {limit:g} {self.display_unit})"
         sense = "least" if self.at_least else "greatest"
         return f"{sense} {self.name_in_words} {worst}, {who}, at {when:.2f} s{bound}"
 
@@ -255,11 +262,6 @@ LIMITS_OF_CURVES = [
 ]
 #: What limits are judged by, by their keys, that positions over time do not show.
 SOURCES = {q.key.removeprefix("limits."): q.source for q in QUANTITIES.values() if q.source}
-
-
-def display_unit(unit: str) -> str:
-    """A unit as pages and figures show it: m/s² for m/s^2."""
-    return unit.replace("^2", "²").replace("^3", "³")
 
 
 def quantity(name: str) -> Quantity:

@@ -74,7 +74,7 @@ def _quantity_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
         return
     e = measured.worst(q.name)
     if e is None and limit is not None and q.who != "pair" and measured.result.interpolation:
-        words = f"{q.name_in_words} cannot be judged (limit {limit:g} {q.unit}): "
+        words = f"{q.name_in_words} cannot be judged (limit {limit:g} {q.display_unit}): "
         words += _NO_MOTION if q in MOTIONS else "positions over time do not show it"
         yield CheckResult(q.name, False, words, None, limit, q.unit, at_least=q.at_least)
     elif e is not None or limit is not None:

@@ -191,7 +191,7 @@ def _with_interval(check: CheckResult, by: float, sigma: float) -> CheckResult:
     at_least = check.at_least or quantity(check.check).at_least
     low, high = worst - by, worst + by
     low = low if at_least or worst < 0.0 else max(low, 0.0)
-    words = f"{check.message}; {value(low)} to {value(high)} {check.unit}".rstrip()
+    words = f"{check.message}; {value(low)} to {value(high, check.unit)}"
     check = replace(check, interval=(low, high), message=words)
     if not check.judged or limit is None:
         return check

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigidfleet._common.facts import Fact
-from rigidfleet._common.quantities import QUANTITIES, display_unit
+from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.verdict import Extreme, Verdict, limit_check
 from rigidfleet.result import Result
@@ -80,7 +80,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
         limit, worst = check.limit, None
         if check.worst is not None and check.when is not None:
             worst = Extreme(check.worst, check.when, check.who, check.phase, check.at_samples)
-        bound = display_unit(q.unit), q.at_least, limit if np.isfinite(limit or 0.0) else None
+        bound = q.display_unit, q.at_least, limit if np.isfinite(limit or 0.0) else None
         judged = worst, check.passed, check.undecided, check.interval
         rows.append(Safety(q.name_in_words, q.text, *bound, *judged))
     return rows

@@ -32,8 +32,23 @@ _BYTES, _FILES, FARTHEST = 256 << 20, 20_000, 1e6
 #: Greatest number of notes on what was read.
 _NOTES = 10
 _ZIP = b"PK"
+#: Exports of motion capture have several lines of names. Motive lets its user choose the axes, and writes them nowhere
+#: ("Axis Convention" in its manual of CSV exports); Vicon's have frames, and markers or bodies as the user chose.
+_CAPTURE = (
+    "is an export of {}, with names of bodies above x, y and z: give one line of names such as time_s,cf1_x_mm,"
+    "cf1_y_mm,cf1_z_mm,cf2_x_mm above the rows, and say --axes eus if y points up"
+)
 #: What is not read, by its first bytes, and what to do with it.
 _REFUSED = {
+    b"Format Version,": _CAPTURE.format("Motive"),
+    **dict.fromkeys(
+        [
+            f"{word}{end}".encode()
+            for word in ("Objects", "Segments", "Trajectories")
+            for end in "\r\n"
+        ],
+        _CAPTURE.format("Vicon"),
+    ),
     b"\x89HDF": "is HDF5. Give a result of `rigidfleet run` alone, and any other data as CSV",
     b"#ROSBAG": "is of ROS 1. Convert it: pip install rosbags; rosbags-convert --src {} --dst FOLDER",
     b"\x1f\x8b": "is compressed. Unpack it: gunzip {}",
@@ -415,8 +430,14 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
         sizes = np.append(moves[moving], np.inf)
         fast = sizes > 0.5 * np.median(sizes)
         odd = (fast[:-2] & fast[1:-1]) | (sizes[1:-1] > 1.5 * sizes[2:])
-        zero = np.abs(curve.pieces[:, :3, 0]).max(axis=1) == 0.0
-        leaps = (moves > _LONGEST * np.median(sizes)) & (zero[:-1] | zero[1:])
+        # One number for x, y and z, such as 9999, stands for no position; 0 may be the origin.
+        place = np.abs(curve.pieces[:, :3, 0])
+        number = np.where((place == place[:, :1]).all(axis=1), place[:, 0], np.nan)
+        leaps = moves > _LONGEST * np.median(sizes)
+        if len(both := np.intersect1d(number[1:][leaps], number[:-1][leaps])) and both[-1] > 0.0:
+            why = f"{name!r} leaps to a place of which each coordinate is {both[-1]:g} m in size, and back"
+            raise _error(source, f"{why}, as if it had none there", "Leave out such rows")
+        leaps &= (number[:-1] == 0.0) | (number[1:] == 0.0)
         frozen += [f"{name!r} at {curve.time[k + 1]:g} s" for k in np.flatnonzero(leaps)[:1]]
         for k in np.flatnonzero((np.diff(moving) > _REPEATED) & odd).tolist():
             start, stop = curve.time[[moving[k] + 1, moving[k + 1]]]

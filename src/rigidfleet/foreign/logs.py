@@ -18,6 +18,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, redirect_stderr, redirect_stdout
 from fnmatch import fnmatchcase
 from importlib.util import find_spec
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,10 +39,16 @@ _JUMP, _UNUSUAL = 0.1, 20.0
 _TWINS, _TIMES = 0.05, 200
 #: Bytes after the last message of a log of ArduPilot that are the rest of its pages.
 _PAGES = 528
-#: Greatest number of things that a note lists.
-_LISTED = 3
+#: A message counts by itself if at least one of so many of its samples is valid and in order.
+_USABLE = 10
+#: A message that came earlier than is usual by more than this has a wrong time [ns].
+_EARLY = 10 * 10**9
+#: Greatest number of things that a note lists; what no position reaches [m].
+_LISTED, FAR = 3, 1e9
 #: How files begin; notes on what is damaged, and on whose clock dates are of.
 ULOG, BIN = b"ULog\x01\x12\x35", b"\xa3\x95"
+#: Bytes before the first message of a ULog, and the kinds of its messages (PX4's guide: ULog file format).
+_ULOG_HEAD, _ULOG_KINDS = 16, frozenset(b"BFIMPQARDLCSO")
 DAMAGED = "the log is damaged in part: what could be read is judged"
 GNSS = "that of the receiver of GNSS, true to its delay of some tenths of a second"
 
@@ -116,14 +123,14 @@ class Channel(NamedTuple):
     topic, message : its name, and that of its messages
     columns : (K,) by field: ``time`` [ns], and where messages came later ``received`` [ns], too
     frame : the one of its positions, if the log names it
-    reference : where on the Earth the origin of local positions is, if the log tells it
+    reference : (K, 3) where on the Earth the origin of local positions is at each sample, if the log tells it
     """
 
     topic: str
     message: str
     columns: dict[str, Any]
     frame: str = ""
-    reference: Geodetic | None = None
+    reference: Floats | None = None
 
 
 class Log(NamedTuple):
@@ -230,7 +237,11 @@ def trajectories_of(
         for channel in sorted(channels, key=unlike):
             try:
                 track = _track_of(channel, origin)
-                break
+                if topics or len(track.time) * _USABLE >= len(channel.columns["time"]):
+                    break
+                reasons.append(
+                    f"{channel.topic}: of its samples, only {len(track.time)} are valid and in order"
+                )
             except ContentError as error:
                 reasons.append(str(error).rstrip("."))
         else:
@@ -325,7 +336,7 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
         raise fault(f"{channel.topic}: its messages are of a form that is not known")
     frame = next((f for f in ("ned", "enu") if channel.frame.endswith(f"_{f}")), form.frame)
     place = _stack_columns(columns, form.place) * form.units[:3]
-    known = np.isfinite(place).all(axis=1)
+    known = np.asarray(np.abs(place) < FAR).all(axis=1)
     known &= (place[:, :2] != 0.0).any(axis=1) | (frame != "geodetic")
     for name in _VALID.keys() & columns.keys():
         known &= columns[name] >= _VALID[name]
@@ -340,16 +351,18 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     own = {name: column[rows] for name, column in columns.items()}
     time, place, velocity, deviation, yaw = own["time"], place[rows], None, None, None
     if "received" in own:  # as if the quickest message came at once
-        time = time + (own["received"] - time).min()
+        late = own["received"] - time
+        time = time + late[late > np.median(late) - _EARLY].min()
     if frame == "geodetic":
         if origin is None:
             notes.append("positions are about the first one: no origin is stated")
-        reference = origin or (*place[0].tolist(),)
-        place = enu_of(place, reference)
+        origin = origin or (*place[0].tolist(),)
+        place = enu_of(place, origin)
     else:
         place = _turn_to_enu(place, frame)
         if reference is not None:
-            place = place + enu_of(np.array([reference]), origin or reference)
+            origin = origin or (*reference[-1].tolist(),)
+            place = place + enu_of(reference[rows], origin)
         elif frame == "ned":
             notes.append("positions are about a place that the log does not tell")
     if form.velocity and {*form.velocity.split()} <= own.keys():
@@ -369,7 +382,8 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
         words = ", ".join(f"{x:.3g} m at {t:.6g} s" for x, t in steps)
         words += f" from its first sample ({len(resets):,} times in all): no vehicle flew that"
         notes.append(f"the estimator moves its position by {words}")
-    origin, frame = reference and (origin or reference), f"{frame} {channel.frame}".strip()
+    origin = None if frame != "geodetic" and reference is None else origin
+    frame = f"{frame} {channel.frame}".strip()
     count = max(len(time), 2), 3  # a single sample stays for a second
     beside = (None if x is None else np.resize(x, count) for x in (velocity, deviation))
     states = LoggedStates(*beside, resets)
@@ -380,9 +394,13 @@ def _stack_columns(columns: dict[str, Any], names: str) -> Floats:
     return np.column_stack([columns[name] for name in names.split()]).astype(np.float64)
 
 
+def swap_enu_and_ned(x: Floats) -> Floats:
+    """Vectors (..., 3) in east, north, up from north, east, down, or back."""
+    return x[..., [1, 0, 2]] * [1.0, 1.0, -1.0]
+
+
 def _turn_to_enu(x: Floats, frame: str) -> Floats:
-    """Vectors (K, 3) in east, north, up."""
-    return x if frame == "enu" else x[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    return x if frame == "enu" else swap_enu_and_ned(x)
 
 
 def _increasing_rows(time: Any, rows: Ints, notes: list[str]) -> Ints:
@@ -410,13 +428,16 @@ def _resets(columns: dict[str, Any], time: Floats, place: Floats, velocity: Floa
     return np.flatnonzero(far > max(_JUMP, _UNUSUAL * float(np.median(far)))) + 1
 
 
-def _last_geodetic(columns: dict[str, Any], names: str, units: Any = 1.0) -> Geodetic | None:
-    """The latest place on the Earth that fields tell, if there is one."""
-    if not {*names.split()} <= columns.keys():
+def _origins_at(time: Ints, stated: dict[str, Any], names: str, units: Any = 1.0) -> Floats | None:
+    """Where the origin was by what was stated last (K, 3), at first by the first statement; None without any."""
+    if not {*names.split()} <= stated.keys():
         return None
-    place = _stack_columns(columns, names) * units
-    known = place[np.isfinite(place).all(axis=1) & (place[:, :2] != 0.0).any(axis=1)]
-    return (*known[-1].tolist(),) if len(known) else None
+    place = _stack_columns(stated, names) * units
+    known = np.isfinite(place).all(axis=1) & (place[:, :2] != 0.0).any(axis=1)
+    if not known.any():
+        return None
+    k = np.searchsorted(stated["time"][known], time, side="right") - 1
+    return place[known][np.maximum(k, 0)]
 
 
 def _read_ulog(path: Path) -> Log:
@@ -435,12 +456,23 @@ def _read_ulog(path: Path) -> Log:
         channels.append(channel_of_px4(topic, x.name, x.data, after))
         if x.name == "actuator_armed":
             armed = channels.pop().columns["time"], x.data["armed"]
-    notes = [DAMAGED] * log.file_corruption
+    notes = [DAMAGED] * (log.file_corruption or _has_unknown_message(path))
     if lost := [x.duration / 1e3 for x in log.dropouts]:
         words = f"{sum(lost):.3g} s in all, at most {max(lost):.3g} s"
         notes.append(f"the logger lost data {len(lost):,} times, {words}")
     clock = GNSS if after else "the dates that the vehicle had" if dated else ""
     return Log({"": channels}, clock, armed, tuple(notes))
+
+
+def _has_unknown_message(path: Path) -> bool:
+    """Whether a ULog has a message of no known kind, where pyulog may stop as at the end of a log."""
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        at = _ULOG_HEAD
+        while at + 3 <= len(data):
+            if data[at + 2] not in _ULOG_KINDS:
+                return True
+            at += 3 + int.from_bytes(data[at : at + 2], "little")
+    return False
 
 
 def channel_of_px4(topic: str, message: str, data: dict[str, Any], after: int = 0) -> Channel:
@@ -451,7 +483,8 @@ def channel_of_px4(topic: str, message: str, data: dict[str, Any], after: int = 
     for field, ned in (("pose_frame", 1), ("local_frame", 0)):
         if field in data:
             data["is_ned"] = data[field] == ned
-    return Channel(topic, message, data, "", _last_geodetic(data, "ref_lat ref_lon ref_alt"))
+    origins = _origins_at(data["time"], data, "ref_lat ref_lon ref_alt")
+    return Channel(topic, message, data, "", origins)
 
 
 def _collect_columns(log: Any) -> dict[tuple[int, str, int], dict[str, Any]]:
@@ -504,18 +537,23 @@ def _read_bin(path: Path) -> Log:
         last = max(int(own[-1]) for own in log.offsets if len(own))
         notes = (DAMAGED,) if log.data_len - last > _PAGES else ()
     beside = {kind: columns for (_, kind, _), columns in table.items() if kind in _BESIDE}
-    channels, dated, place = [], False, None
-    if own := beside.get("ORGN"):  # type 0 is the origin of the filter
-        place = _last_geodetic({k: x[own["Type"] == 0] for k, x in own.items()}, "Lat Lng Alt")
+    channels, dated, origin = [], False, beside.get("ORGN", {})
+    if origin:  # type 0 is the origin of the filter
+        origin = {k: x[origin["Type"] == 0] for k, x in origin.items()}
     for (_, kind, lane), columns in table.items():
         if kind in _BESIDE:
             continue
         dated, own = bool(columns["time"][0] > _DATES), beside.get(f"{kind[0]}KF4")
         del columns["received"]
         main = lane == (int(np.median(own["PI"])) if own and kind[1:] == "KF1" else 0)
+        if main and own and kind[1:] == "KF1" and (share := float(np.mean(own["PI"] != lane))):
+            notes += (
+                f"in {100 * share:.2g} % of the log, the estimator trusted another core than {kind}:{lane}",
+            )
         if main and kind[1:] == "KF1" and (own := beside.get(f"{kind[0]}KV1")):
             at = columns["time"], own["time"]
             columns |= {name: np.interp(*at, own[name]) for name in _VARIANCES.split()}
+        place = _origins_at(columns["time"], origin, "Lat Lng Alt")
         made = Channel(f"{kind}:{lane}" if lane else kind, kind, columns, "", place)
         channels.insert(0 if main else len(channels), made)
     armed = (own["time"], own["ArmState"]) if (own := beside.get("ARM")) else None
@@ -535,7 +573,11 @@ def _read_tlog(path: Path) -> Log:
     for (who, kind, lane), columns in sorted(table.items(), key=lambda each: each[0][2]):
         if kind not in _BESIDE:
             own = table.get((who, "GPS_GLOBAL_ORIGIN", 0), {})
-            place, frame = _last_geodetic(own, _BESIDE["GPS_GLOBAL_ORIGIN"], _INTEGERS[:3]), ""
+            # The vehicle does not stamp it: it counts from when it came.
+            own, frame = own | {"time": own.get("received")}, ""
+            place = _origins_at(
+                columns["received"], own, _BESIDE["GPS_GLOBAL_ORIGIN"], _INTEGERS[:3]
+            )
             if "frame_id" in columns:
                 frame = _FRAMES.get(int(columns["frame_id"][0]), "")
                 columns["is_ned"] = (columns["frame_id"] == columns["frame_id"][0]) & bool(frame)

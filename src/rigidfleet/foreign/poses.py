@@ -29,7 +29,15 @@ import numpy as np
 from rigidfleet._common.names import WANTED
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.foreign.columns import yaws_of
-from rigidfleet.foreign.logs import DAMAGED, FORMS, Channel, Log, channel_of_px4, choose_channels
+from rigidfleet.foreign.logs import (
+    DAMAGED,
+    FAR,
+    FORMS,
+    Channel,
+    Log,
+    channel_of_px4,
+    choose_channels,
+)
 
 #: How recordings begin, and what Zstandard packed.
 MCAP, SQLITE, ZSTANDARD = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
@@ -41,14 +49,20 @@ _NO_VEHICLE = re.compile(rf":(.*[/_])?(map|odom)$|(?<![a-z])({'|'.join(sorted(WA
 _CAPITAL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 #: Greatest size of a chunk of a recording when it is unpacked, and of a message [bytes].
 _CHUNK, _MESSAGE = 32 << 20, 1 << 20
-#: What no position [m] or quaternion reaches.
-_FAR = 1e9
 #: Numbers of a message after its names: a position and a quaternion (7), the covariance of a pose (36, by rows), and a
 #: velocity in the vehicle's axes (3); or latitude, longitude [deg] and height [m] (3).
 _NUMBERS = {
     "PoseStamped": 7, "PoseWithCovarianceStamped": 43, "Odometry": 46, "TransformStamped": 7, "TFMessage": 7,
     "NamedPoseArray": 7, "NavSatFix": 3,
 }  # fmt: skip
+#: Packages whose messages these are; others may have messages of these names, with other fields.
+_PACKAGES = (
+    "geometry_msgs",
+    "nav_msgs",
+    "sensor_msgs",
+    "tf2_msgs",
+    "motion_capture_tracking_interfaces",
+)
 
 
 #: Topic and body, how their `_Rows` begin, stamp and time of recording [ns], and numbers of a position.
@@ -155,6 +169,8 @@ def _read_positions(path: Path, unread: dict[str, str]) -> Iterator[_Place]:
             unread[topic] = _PATH
         elif own and kind in FORMS and not definition:
             unread[topic] = _UNDEFINED
+        elif kind in _NUMBERS and package not in _PACKAGES:
+            unread[topic] = f"has messages of {name}, whose fields are not known"
         elif kind in (FORMS if own else _NUMBERS) and topic != "/tf_static":
             if code != "cdr":
                 raise fault(f"{topic}: is encoded as {code!r}, not as CDR")
@@ -196,12 +212,12 @@ def _records_of_mcap(path: Path) -> Iterator[tuple[str, str, str, str, bytes, in
 
     schemas, topics = {0: ("", "")}, {}
     with path.open("rb") as stream:
-        for whole in StreamReader(stream, emit_chunks=True).records:
+        for whole in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
             packed = isinstance(whole, records.Chunk)
             if packed and whole.uncompressed_size > _CHUNK:
                 more = f"unpacks to {whole.uncompressed_size >> 20} MiB"
                 raise fault(f"a chunk of it {more}", "Record poses")
-            for record in breakup_chunk(whole) if packed else [whole]:
+            for record in breakup_chunk(whole, validate_crc=True) if packed else [whole]:
                 if isinstance(record, records.Schema):
                     schemas[record.id] = record.name, record.data.decode(errors="replace")
                 elif isinstance(record, records.Channel):
@@ -283,7 +299,7 @@ def _channel_of_rows(topic: str, rows: _Rows) -> Channel:
     if rows.message == "NavSatFix":
         columns = dict(zip(("time", "lat", "lon", "alt"), (time, *table.T), strict=True))
         return Channel(topic, rows.message, columns, rows.frame)
-    known = np.asarray(np.abs(table[:, :7]).max(axis=1) < _FAR)
+    known = np.asarray(np.abs(table[:, :7]).max(axis=1) < FAR)
     columns = {
         "time": time, "x": np.where(known, table[:, 0], np.nan),
         "y": table[:, 1], "z": table[:, 2], "yaw": yaws_of(np.where(known[:, None], table[:, 3:7], 0.0)),

@@ -29,6 +29,12 @@ _TYPES = {
 _AXES, _HUES = ["x", "y", "z"], ["red", "green", "blue"]
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _ENDS: dict[str, Any] = {"<": "little", ">": "big"}
+#: What is not read, by its suffix, and what to give instead.
+_OTHERS = {
+    ".pcd": ("is a point cloud of PCL", "save it as PLY, or its points as text"),
+    ".obj": ("is a mesh of Wavefront", "save its vertices as PLY, or as text"),
+    ".dxf": ("is a drawing of CAD", "save it as SVG, or its points as text"),
+}
 Colours = tuple[str, ...] | None
 Notes = tuple[str, ...]
 
@@ -77,6 +83,9 @@ def parse_points(data: bytes, name: str, *, repeated: bool = False) -> Points:
         As `read_points` does.
     """
     suffix, place = Path(name).suffix.lower(), "point"
+    if suffix in _OTHERS:
+        problem, remedy = _OTHERS[suffix]
+        raise MissionError([Finding(name, "", None, problem, f"{remedy}: x, y, z [m]")])
     try:
         if suffix in (".npy", ".ply"):
             points, colours, notes = _read_npy(data) if suffix == ".npy" else _read_ply(data)

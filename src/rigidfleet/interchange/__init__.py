@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -87,11 +88,13 @@ FORMATS: dict[str, Format] = {
         "position and yaw (pieces of degree 7)", "tilt and rotors",
     ),
     "poly4d": Format(
-        crazyflie.write_poly4d, crazyflie.read_poly4d, "bin", True, 1e-3,
+        partial(crazyflie.write_within_memory, crazyflie.poly4d_images),
+        crazyflie.read_poly4d, "bin", True, 1e-3,
         "position and yaw (pieces of degree 7)", "tilt and rotors",
     ),
     "compressed": Format(
-        crazyflie.write_compressed, crazyflie.read_compressed, "bin", True, 5e-3,
+        partial(crazyflie.write_within_memory, crazyflie.compressed_images),
+        crazyflie.read_compressed, "bin", True, 5e-3,
         "position and yaw (pieces of degree 7 in whole mm)", "tilt and rotors",
     ),
     "skyc": Format(

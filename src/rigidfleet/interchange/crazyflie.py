@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
-from functools import wraps
 
 import numpy as np
 
@@ -40,26 +39,27 @@ _TRIED = tuple(1e-3 * np.array([2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 20
 _Image = tuple[bytes, str, list[tuple[int, float]]]
 
 
-def _refuse_beyond_memory(
-    images: Callable[[ExportedMotion, float], Iterator[_Image]],
-) -> Callable[[ExportedMotion, float], Iterator[bytes]]:
-    """A writer of images, with an error about one that does not fit: which tolerance, and how many seconds do."""
+def write_within_memory(
+    images: Callable[[ExportedMotion, float], Iterator[_Image]], motion: ExportedMotion, tolerance: float
+) -> Iterator[bytes]:  # fmt: skip
+    """Images that fit the vehicle's memory.
 
-    @wraps(images)
-    def write_within_memory(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
-        for agent, (data, needed, ends) in enumerate(images(motion, tolerance)):
-            if len(data) > MEMORY:
-                alone, wider = motion.of_vehicle(agent), [x for x in _TRIED if x > tolerance]
-                enough = next((x for x in wider if len(next(images(alone, x))[0]) <= MEMORY), None)
-                remedy = f"--tolerance {enough:g}" if enough else "No tolerance up to 1 m"
-                until = max((t for size, t in ends if size <= MEMORY), default=ends[0][1])
-                raise ResultError(
-                    f"the flight of agent {agent + 1} needs {needed}. {remedy} makes it fit; at "
-                    f"{1e3 * tolerance:g} mm, the first {until:.1f} s fit."
-                )
-            yield data
-
-    return write_within_memory
+    Raises
+    ------
+    ResultError
+        One does not fit: which tolerance, and how many seconds do.
+    """
+    for agent, (data, needed, ends) in enumerate(images(motion, tolerance)):
+        if len(data) > MEMORY:
+            alone, wider = motion.of_vehicle(agent), [x for x in _TRIED if x > tolerance]
+            enough = next((x for x in wider if len(next(images(alone, x))[0]) <= MEMORY), None)
+            remedy = f"--tolerance {enough:g}" if enough else "No tolerance up to 1 m"
+            until = max((t for size, t in ends if size <= MEMORY), default=ends[0][1])
+            raise ResultError(
+                f"the flight of agent {agent + 1} needs {needed}. {remedy} makes it fit; at "
+                f"{1e3 * tolerance:g} mm, the first {until:.1f} s fit."
+            )
+        yield data
 
 
 def write_polynomial(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
@@ -70,15 +70,8 @@ def write_polynomial(motion: ExportedMotion, tolerance: float) -> Iterator[bytes
         yield "\n".join([_HEADER, *lines, ""]).encode()
 
 
-@_refuse_beyond_memory
-def write_poly4d(motion: ExportedMotion, tolerance: float) -> Iterator[_Image]:
-    """A memory image for each vehicle: pieces of 32 coefficients and a duration, as 32-bit floats.
-
-    Raises
-    ------
-    ResultError
-        The flight needs more than `PIECES` pieces.
-    """
+def poly4d_images(motion: ExportedMotion, tolerance: float) -> Iterator[_Image]:
+    """A memory image for each vehicle: pieces of 32 coefficients and a duration, as 32-bit floats."""
     for curve in fit_curves(motion.curve_chunks(), tolerance):
         rows, after = np.roll(curve_to_rows(curve), -1, axis=1), curve.time - curve.time[0]
         needed = f"{len(rows)} pieces of {_POLY4D} bytes, and the memory has room for {PIECES}"
@@ -87,20 +80,19 @@ def write_poly4d(motion: ExportedMotion, tolerance: float) -> Iterator[_Image]:
 
 
 def read_poly4d(data: bytes) -> list[Piecewise]:
-    """The way in an image of `write_poly4d`, from time zero on."""
+    """The way in an image of `poly4d_images`, from time zero on."""
     rows = np.frombuffer(data, "<f4").reshape(-1, 4 * POWERS + 1)
     return [rows_to_curve(np.roll(rows, 1, axis=1))]
 
 
-@_refuse_beyond_memory
-def write_compressed(motion: ExportedMotion, tolerance: float) -> Iterator[_Image]:
+def compressed_images(motion: ExportedMotion, tolerance: float) -> Iterator[_Image]:
     """A compressed image for each vehicle: Bernstein coefficients in millimetres and tenths of a degree.
 
     Raises
     ------
     ResultError
-        The tolerance is not more than the rounding, or the flight needs more than `MEMORY` bytes, a length more than
-        32.767 m, or a piece more than 65.535 s.
+        The tolerance is not more than the rounding, or the flight needs a length of more than 32.767 m, or a piece of
+        more than 65.535 s.
     """
     if tolerance <= COMPRESSED_ROUNDING:
         raise ResultError(
@@ -152,7 +144,7 @@ def _compressed_image(curve: Piecewise, number: int) -> _Image:
 
 
 def read_compressed(data: bytes) -> list[Piecewise]:
-    """The way in an image of `write_compressed`, from time zero on."""
+    """The way in an image of `compressed_images`, from time zero on."""
     units = [_MM, _MM, _MM, _TENTH]
     at = [x * unit for x, unit in zip(struct.unpack_from("<4h", data), units, strict=True)]
     place, rows = 8, []

@@ -30,6 +30,8 @@ _CORNERS = np.kron(np.eye(3), [[1.0], [-1.0]]) + 0.0  # no -0.0
 _FACES = np.array(
     [[2, 4, 0], [2, 1, 4], [2, 5, 1], [2, 0, 5], [3, 0, 4], [3, 4, 1], [3, 1, 5], [3, 5, 0]]
 )
+#: Turns rows (..., 3) with z up to rows with y up; its transpose turns them back.
+_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
@@ -133,7 +135,7 @@ def _add_lights(scene: dict[str, Any], file: _File, motion: ExportedMotion) -> N
     far = float(np.linalg.norm(high - low)) / 2 / np.sin(_FOV / 2)
     right, up, back = lights.camera_axes(*lights.angles_facing_formation(result))
     axes = np.stack([right, up, back, (low + high) / 2 + far * back])
-    matrix = np.column_stack([_z_up_to_y_up(axes), [0.0, 0.0, 0.0, 1.0]]).ravel().tolist()
+    matrix = np.column_stack([axes @ _Y_UP, [0.0, 0.0, 0.0, 1.0]]).ravel().tolist()
     seen = {"yfov": _FOV, "znear": 0.01 * far, "zfar": 10 * far}
     scene["cameras"] = [{"type": "perspective", "perspective": seen}]
     scene["nodes"].append({"name": "front", "camera": 0, "matrix": matrix})
@@ -161,7 +163,7 @@ def read_gltf(data: bytes) -> list[Piecewise]:
             [array(animation["samplers"][channel["sampler"]][key]) for key in ("input", "output")]
             for channel in (moved, turned)
         )
-        before, at, after = (_y_up_to_z_up(x) for x in values.reshape(-1, 3, 3).swapaxes(0, 1))
+        before, at, after = (x @ _Y_UP.T for x in values.reshape(-1, 3, 3).swapaxes(0, 1))
         begin, end = np.stack([at[:-1], after[:-1]]), np.stack([at[1:], before[1:]])
         yaw = np.unwrap(2.0 * np.arctan2(quaternions[:, 1], quaternions[:, 3]))
         way = Piecewise.of_end_states(time[:, 0], begin, end)
@@ -174,12 +176,4 @@ def _hermite_rows(curve: Piecewise) -> Floats:
     begin, end = (x[..., :3].swapaxes(0, 1) for x in curve.piece_end_states(2))
     rows = np.zeros((len(curve.time), 3, 3))
     rows[1:, :2], rows[:-1, 1:] = end[:, ::-1], begin
-    return _z_up_to_y_up(rows.reshape(-1, 3))
-
-
-def _z_up_to_y_up(x: Floats) -> Floats:
-    return np.stack([x[..., 0], x[..., 2], -x[..., 1]], axis=-1)
-
-
-def _y_up_to_z_up(x: Floats) -> Floats:
-    return np.stack([x[..., 0], -x[..., 2], x[..., 1]], axis=-1)
+    return rows.reshape(-1, 3) @ _Y_UP

@@ -30,11 +30,9 @@ def light_program(changes: list[Fade], agent: int, start: float, end: float) -> 
     yield _END
 
 
-def _varint(number: int) -> bytes:
+def _varint(number: int) -> Iterator[int]:
     """A whole number from 0, seven bits to a byte, the lowest first; the eighth bit says that more follow."""
-    encoded = bytearray()
     while number > 0x7F:
-        encoded.append(number & 0x7F | 0x80)
+        yield number & 0x7F | 0x80
         number >>= 7
-    encoded.append(number)
-    return bytes(encoded)
+    yield number

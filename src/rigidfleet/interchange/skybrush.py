@@ -51,23 +51,19 @@ def write_skyc(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
         points = _bezier_segments(curve)
         off = round(float(motion.result.motors_off[agent]) - motion.start, 6)
         span = {"takeoffTime": 0, "landingTime": min(off, points[-1][0])}
-        files[f"{folder}/trajectory.json"] = {"version": 1, "points": points, **span}
         times, yaws = yaw_knots(curve)
         clockwise = -np.degrees(yaws)
         clockwise -= 360.0 * np.floor(clockwise[0] / 360.0)
         setpoints = np.column_stack([times.round(6), clockwise.round(4)]).tolist()
-        files[f"{folder}/yaw.json"] = {"version": 1, "setpoints": setpoints}
         program = bytes(light_program(changes, agent, motion.start, motion.end))
-        light = base64.b64encode(program).decode()
-        files[f"{folder}/lights.json"] = {"version": 1, "data": light}
-        settings = {
-            "name": name,
-            "home": points[0][1],
-            "landAt": points[-1][1],
-            "trajectory": {"$ref": f"./{folder}/trajectory.json#"},
-            "yawControl": {"$ref": f"./{folder}/yaw.json#"},
-            "lights": {"$ref": f"./{folder}/lights.json#"},
-        }
+        settings = {"name": name, "home": points[0][1], "landAt": points[-1][1]}
+        for key, file, content in (
+            ("trajectory", "trajectory", {"points": points, **span}),
+            ("yawControl", "yaw", {"setpoints": setpoints}),
+            ("lights", "lights", {"data": base64.b64encode(program).decode()}),
+        ):
+            files[f"{folder}/{file}.json"] = {"version": 1, **content}
+            settings[key] = {"$ref": f"./{folder}/{file}.json#"}
         drones.append({"type": "generic", "settings": settings})
     cues = [
         {"name": phase.name, "time": round(phase.t_start - motion.start, 6)}

@@ -211,8 +211,8 @@ def reached_in_words(worst: Reached, phase: Phase) -> str:
     """What is reached of a limit, in words."""
     q, most = worst.limit.of, worst.limit.most[worst.agent]
     return (
-        f"agent {worst.agent + 1} would need {worst.value:.3g} {q.unit} of {q.name_in_words} at {worst.time:.2f} s in"
-        f" '{phase.name}' (limit {most:g} {q.unit})"
+        f"agent {worst.agent + 1} would need {worst.value:.3g} {q.display_unit} of {q.name_in_words} at"
+        f" {worst.time:.2f} s in '{phase.name}' (limit {most:g} {q.display_unit})"
     )
 
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, display_unit
+from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity
 from rigidfleet.math import attitude as att
 from rigidfleet.plotting import quadrotors
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.peaks import IDLE, Panel, distinct_limits, peak_before_breakdown
+from rigidfleet.plotting.peaks import IDLE, Panel, peak_before_breakdown
 from rigidfleet.result import Extremum, Result
 from rigidfleet.result.quantities import owner_name, samples
 from rigidfleet.typing import Floats
@@ -266,12 +266,10 @@ def has_thrust(result: Result) -> bool:
 
 def draw_thrust_or_distance(ax: Axes, result: Result) -> None:
     """Thrust of each agent with its limit, from zero; of a log, which has none, the distance from its slot."""
-    if not has_thrust(result):
+    if has_thrust(result):
+        quadrotors.draw_with_limit(ax, result, "thrust", result.thrust, always=False)
+    else:
         quadrotors.draw_with_limit(ax, result, "tracking_error")
-        return
-    ax.set_ylabel("thrust [N]")
-    panel = Panel(ax, result, result.thrust, "N", result.extreme("thrust"))
-    panel.draw(distinct_limits(result.mission, QUANTITIES["thrust"]), always=False)
 
 
 @st.styled_figure(has_thrust, "forces are not known")
@@ -399,7 +397,7 @@ def constraint_error(result: Result) -> Figure:
 def draw_least(ax: Axes, result: Result, name: str) -> None:
     """Least values, such as distances to others, to obstacles, or of falls to people, with their limit."""
     q, sampled = QUANTITIES[name], samples(result, name)
-    unit = display_unit(q.unit)
+    unit = q.display_unit
     ax.set_ylabel(f"{q.axis or q.name_in_words} [{unit}]")
     values, limit = getattr(result, name, sampled.worst), q.limit_of(result.mission) or 0.0
     values = np.where(np.isfinite(values), values, np.nan)

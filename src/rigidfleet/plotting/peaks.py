@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import Quantity, display_unit
+from rigidfleet._common.quantities import Quantity
 from rigidfleet.plotting import style as st
 from rigidfleet.result import Extremum, Result
 from rigidfleet.typing import Floats
@@ -36,7 +36,7 @@ def peak_before_breakdown(result: Result, values: Floats) -> float:
 
 def distinct_limits(mission: Mission, q: Quantity) -> list[Limit]:
     """Each distinct limit that a mission sets with a label and a colour; the agent's if only one has it."""
-    limit, unit = q.limit_of(mission), display_unit(q.unit)
+    limit, unit = q.limit_of(mission), q.display_unit
     values = np.full(mission.n_agents, np.nan if limit is None else limit, dtype=float)
     colours = st.agent_colours(len(values))
     lines = []

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidfleet._common.quantities import QUANTITIES, display_unit
+from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.logged import true_runs
 from rigidfleet.plotting.peaks import Panel, distinct_limits
@@ -78,11 +78,9 @@ def _draw_rotor_limit_shares(ax: Axes, result: Result) -> None:
 def _draw_rotors_of_nearest(ax: Axes, result: Result) -> None:
     """The four rotors of the vehicle that comes nearest to its limit, enlarged."""
     limits, force = rotor_limit(result.mission), rotor_forces(result)
+    nearest = _rotor_nearest_to_limit(result, limits)
     peak = np.fmax.reduce(force, axis=(0, 2)) / limits
-    i = int(np.nanargmax(peak))
-    e = _rotor_nearest_to_limit(result, limits)
-    if e is not None and e.value / limits[e.who] > peak[i]:
-        i = e.who
+    i = int(np.nanargmax(peak)) if nearest is None else nearest.who
     colours = st.colour_scale(4)
     for k, colour in enumerate(colours):
         ax.plot(result.time, force[:, i, k], color=colour, linewidth=1.9 - 0.35 * k)
@@ -112,18 +110,23 @@ def vehicles(result: Result) -> Figure:
     return fig
 
 
-def draw_with_limit(ax: Axes, result: Result, name: str, values: Floats | None = None) -> bool:
-    """Draw each agent's values (K, N) of a quantity, their greatest and the limits; return whether there are any."""
+def draw_with_limit(
+    ax: Axes, result: Result, name: str, values: Floats | None = None, *, always: bool = True
+) -> bool:
+    """Draw each agent's values (K, N) of a quantity, their greatest and the limits; return whether there are any.
+
+    Without ``always``, the greatest is written only if it is off the scale.
+    """
     q, between = QUANTITIES[name], result.extreme(name)
-    ax.set_ylabel(f"{q.name_in_words.replace(' ', chr(10))} [{display_unit(q.unit)}]")
+    ax.set_ylabel(f"{q.name_in_words.replace(' ', chr(10))} [{q.display_unit}]")
     values = samples(result, name).values if values is None else values
     if not np.isfinite(values).any():
         st.mark_empty(ax, q.nothing)
         return False
     if between is not None:
         between = between._replace(value=q.scale * between.value, other=-1)
-    panel = Panel(ax, result, values, display_unit(q.unit), between)
-    return panel.draw(distinct_limits(result.mission, q))
+    panel = Panel(ax, result, values, q.display_unit, between)
+    return panel.draw(distinct_limits(result.mission, q), always=always)
 
 
 def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:

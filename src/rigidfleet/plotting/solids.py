@@ -42,11 +42,6 @@ class DrawnObstacle:
     grid: tuple[Floats, Floats, Floats] | None  # x, y and heights of a height map
 
     @property
-    def is_terrain(self) -> bool:
-        """Whether it is a height map."""
-        return self.grid is not None
-
-    @property
     def extent(self) -> Floats:
         """Lowest and highest corner (2, 3) [m] of all places at which it is drawn."""
         points = self.surface.triangles.reshape(-1, 3)
@@ -106,14 +101,14 @@ def draw_obstacle_in_space(ax: Axes3D, shape: DrawnObstacle) -> None:
             paint = tuple(1.0 - opacity * (1.0 - np.array(to_rgb(colour))))
         look: dict[str, Any] = {"linewidths": 0, "antialiaseds": shape.zone}
         look |= {"shade": True, "lightsource": LightSource(_FROM, _ABOVE)}
-        zorder = 0.5 if shape.is_terrain else 2
+        zorder = 0.5 if shape.grid else 2
         sides = Poly3DCollection(faces + at, facecolors=[paint], **look, zorder=zorder)
         sides.set_gid("obstacle")
         ax.add_collection3d(sides)
         ax.add_collection3d(
             Line3DCollection(
                 list(shape.surface.lines + at), colors=colour, linewidths=0.5, linestyles=dashes,
-                alpha=0.9 * float(share), zorder=0.6 if shape.is_terrain else 2.1,
+                alpha=0.9 * float(share), zorder=0.6 if shape.grid else 2.1,
             )
         )  # fmt: skip
     if len(shape.way) > 1:
@@ -144,7 +139,7 @@ def draw_obstacle_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     points = shape.surface.triangles.reshape(-1, 3)[:, :2]
     look: dict[str, Any] = {"facecolor": colour, "linewidth": 0, "zorder": 1}
     dashed: dict[str, Any] = {"colors": colour, "linestyles": [(0, (4, 2))], "linewidths": 0.8}
-    if shape.grid is not None:
+    if shape.grid:
         x, y, z = shape.grid
         low_to_high = LinearSegmentedColormap.from_list("terrain", ["#F4F1EA", COLOUR])
         ax.contourf(x, y, z.T, 8, cmap=low_to_high, alpha=0.5, zorder=0.8)
@@ -153,8 +148,8 @@ def draw_obstacle_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     low, high = points.min(axis=0), points.max(axis=0)
     corner = Path([low, [high[0], low[1]], high])
     for at, share in zip(shape.at, _place_opacities(shape), strict=True):
-        opacity = 0.0 if shape.is_terrain else 0.3 if not shape.zone else 0.1
-        path = corner if shape.is_terrain else area_from_above(shape.surface.triangles + at)
+        opacity = 0.0 if shape.grid else 0.3 if not shape.zone else 0.1
+        path = corner if shape.grid else area_from_above(shape.surface.triangles + at)
         patch = ax.add_patch(PathPatch(path, **look, alpha=opacity * float(share)))
         if shape.zone:
             lines = list((shape.surface.lines + at)[..., :2])

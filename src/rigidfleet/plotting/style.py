@@ -380,16 +380,15 @@ def draw_legend(ax: Axes, handles: Sequence[Any], title: str = "") -> None:
             "borderaxespad": 4.5 if last else 0.8,
             "ncols": legend_columns(handles),
         }
-    if handles:
-        ax.legend(
-            handles=handles, loc="upper left", title=title or None, title_fontsize=8, alignment="left",
-            labelspacing=0.3, **look,
-        )  # fmt: skip
+    ax.legend(
+        handles=handles, loc="upper left", title=title or None, title_fontsize=8, alignment="left",
+        labelspacing=0.3, **look,
+    )  # fmt: skip
 
 
 def legend_columns(handles: Sequence[Any]) -> int:
     """Number of columns of a legend below a figure over time, in which no entry is cut."""
-    longest = max((len(str(h.get_label())) for h in handles), default=1)
+    longest = max(len(str(h.get_label())) for h in handles)
     return max(int(16 * (figure_width(FIGURE_WIDTH) - 0.7)) // (longest + 7), 1)
 
 

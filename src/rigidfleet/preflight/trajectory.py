@@ -318,7 +318,7 @@ def measured_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark
     """Remarks on what is measured of positions and velocities beyond its limit in a phase; of the geofence, too."""
     for q, (worst, when, who, limit) in _measured_peaks(mission, [planned]):
         if q.rank(worst) > q.rank(limit) + LEEWAY:
-            text = q.in_words(f"{worst:.2f} {q.unit}", who, when, limit)
+            text = q.in_words(f"{worst:.2f} {q.display_unit}", who, when, limit)
             level = "fails" if planned.exact else "note"
             yield Remark(level, q.name_in_words, f"{text} in '{planned.phase}'")
 
@@ -335,7 +335,7 @@ def _broken_limit_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[R
         k, i = np.unravel_index(int((size / limit.most).argmax()), size.shape)
         if size[k, i] > (most := limit.most[i]) * (1 + 1e-3):
             text = (
-                f"agent {i + 1} reaches {size[k, i]:.3g} {q.unit}{of} at {planned.time[k]:.2f} s in"
-                f" '{planned.phase}' (limit {most:g} {q.unit})"
+                f"agent {i + 1} reaches {size[k, i]:.3g} {q.display_unit}{of} at {planned.time[k]:.2f} s in"
+                f" '{planned.phase}' (limit {most:g} {q.display_unit})"
             )
             yield Remark("fails" if planned.exact else "note", q.name_in_words, text)

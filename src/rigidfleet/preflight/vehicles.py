@@ -137,7 +137,7 @@ def vehicle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     jump = preflight.vehicles.jump
     if jump is not None and jump[0] > _JUMP:
         text = (
-            f"the reference's acceleration jumps by {jump[0]:.2f} m/s^2 ({jump[1]:.1f} deg of tilt) at {jump[2]:.2f} s,"
+            f"the reference's acceleration jumps by {jump[0]:.2f} m/s² ({jump[1]:.1f} deg of tilt) at {jump[2]:.2f} s,"
             f" where '{jump[3]}' begins; no vehicle follows a jump. Use smoothness = 'jerk'"
         )
         yield Remark("note", "jumps", text)

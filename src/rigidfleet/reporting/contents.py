@@ -12,8 +12,7 @@ import numpy as np
 
 from rigidfleet import plotting
 from rigidfleet._common.facts import Cell, FactTable, Level, Row, value
-from rigidfleet._common.quantities import QUANTITIES, display_unit, quantity
-from rigidfleet._common.text import all_hold_in_words
+from rigidfleet._common.quantities import QUANTITIES, quantity
 from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
 from rigidfleet.plotting import encode_figure
@@ -102,8 +101,10 @@ def _names_of(flights: Sequence[Result]) -> list[str]:
 def _flight_data(result: Result, verdict: Verdict, label: str, colour: str) -> dict[str, Any]:
     """What the template of a page shows of one flight, by the template's names."""
     mission = result.mission
-    judged = [check for check in verdict.checks if check.judged]
-    failed = verdict.failures or verdict.undecided_checks
+    first, *rest = verdict.summary.split("\n")
+    head, _, praise = first.partition(": ")[2].partition("; ")
+    head = head.partition(".")[0]
+    failed = [line.removeprefix("- ") for line in rest if line.startswith("- ")]
     return {
         "label": label,
         "head_cell": Cell(label, colour=colour),
@@ -112,11 +113,8 @@ def _flight_data(result: Result, verdict: Verdict, label: str, colour: str) -> d
         "source": mission.source,
         "passed": verdict.passed,
         "word": verdict.word,
-        "head": f"{len(failed)} of {len(judged)} checks {verdict.word}"
-        if failed
-        else all_hold_in_words(len(judged)),
-        "words": [f.message for f in (*verdict.failures, *verdict.undecided_checks)]
-        or [verdict.summary.split("\n")[0].partition("; ")[2] or verdict.covers],
+        "head": head,
+        "words": failed or [praise or verdict.covers],
         "notes": [verdict.uncalled, *verdict.notes] if verdict.uncalled else verdict.notes,
         "plan": brief.plan_sentences(result),
         "phases": mission.phase_table,
@@ -264,7 +262,7 @@ def _number_comparison_table(
         ("failed checks", "", lambda _, v: float(sum(not f.passed for f in v.checks))),
         ("greatest waypoint miss", "m", partial(_worst_of, "waypoint_position")),
         ("mean thrust of a vehicle", "N", lambda r, _: _mean_thrust(r)),
-        *((q.text, display_unit(q.unit), partial(_worst_of, q.name)) for q in QUANTITIES.values()),
+        *((q.text, q.display_unit, partial(_worst_of, q.name)) for q in QUANTITIES.values()),
     ]
     rows = []
     for name, unit, measure in measures:

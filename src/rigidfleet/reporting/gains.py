@@ -24,8 +24,15 @@ GainLine = tuple[str, str, str]
 
 def gain_lines(mission: Mission) -> list[GainLine]:
     """The gains of a mission, one by one."""
-    constraint = _constraint_lines(mission) if len(mission.edges) else []
-    return [*constraint, *_tracking_lines(mission), *_regulator_lines(mission)]
+    lines = _constraint_lines(mission) if len(mission.edges) else []
+    if any(phase.tracks_slots for phase in mission.phases):
+        k1, k2 = mission.tracking_gains
+        meaning = f"each vehicle follows its slot: {_behaviour_in_words(k1, k2)}"
+        lines.append(("tracking", f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s", meaning))
+    if any(phase.steering is not None for phase in mission.phases):
+        lines.append(_regulator_line("centre of mass", mission.lqr))
+        lines.append(_regulator_line("attitude", mission.lqr.attitude))
+    return lines
 
 
 def _constraint_lines(mission: Mission) -> list[GainLine]:
@@ -72,21 +79,6 @@ def _solver_damping_in_words(mission: Mission) -> str:
     every = [mission.damping(name) for name in mission.formations] or [mission.damping(None)]
     low, high = f"{min(every):.2g}", f"{max(every):.2g}"
     return low if low == high else f"{low} to {high}"
-
-
-def _tracking_lines(mission: Mission) -> list[GainLine]:
-    if not any(phase.tracks_slots for phase in mission.phases):
-        return []
-    k1, k2 = mission.tracking_gains
-    meaning = f"each vehicle follows its slot: {_behaviour_in_words(k1, k2)}"
-    return [("tracking", f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s", meaning)]
-
-
-def _regulator_lines(mission: Mission) -> list[GainLine]:
-    if not any(phase.steering is not None for phase in mission.phases):
-        return []
-    pairs = (("centre of mass", mission.lqr), ("attitude", mission.lqr.attitude))
-    return [_regulator_line(name, regulator) for name, regulator in pairs]
 
 
 def _regulator_line(name: str, regulator: Regulator) -> GainLine:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import QUANTITIES, display_unit
+from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet.plotting import encode_figure
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.peaks import distinct_limits
@@ -56,7 +56,7 @@ def svg_of_time_curves(flights: Sequence[Result], labels: Sequence[str]) -> byte
             for limit in dict.fromkeys(x for f in flights for x in distinct_limits(f.mission, q)):
                 st.draw_limit(ax, *limit)
             worst = "least" if q.at_least else "greatest"
-            ax.set_title(f"{worst} {q.name_in_words} [{display_unit(q.unit)}]", loc="left")
+            ax.set_title(f"{worst} {q.name_in_words} [{q.display_unit}]", loc="left")
             if not known:
                 st.mark_empty(ax, "nothing to show")
             elif logarithmic:

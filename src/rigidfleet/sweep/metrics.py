@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidfleet._common.quantities import QUANTITIES, display_unit
+from rigidfleet._common.facts import display_unit
+from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet.math import proximity
 from rigidfleet.typing import Floats
 

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
+from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown, display_unit
 from rigidfleet._common.plain import to_json_data
-from rigidfleet._common.quantities import display_unit
 from rigidfleet.sweep import store
 from rigidfleet.sweep.faults import FAULTS
 from rigidfleet.sweep.metrics import METRICS, readable_unit

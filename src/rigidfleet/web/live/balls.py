@@ -60,8 +60,6 @@ class Ball:
 
     def note_way_corner(self, t: float) -> None:
         """Note where its velocity changes, at t [s]."""
-        if self.turns and self.turns[-1][0] >= t:
-            self.turns.pop()
         self.turns.append((t, self.place.copy()))
         self.changed = False
 

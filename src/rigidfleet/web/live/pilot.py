@@ -22,6 +22,7 @@ from rigidfleet.planning.reference import Pose
 from rigidfleet.result import Result
 from rigidfleet.simulation.flight import Flight
 from rigidfleet.simulation.recording import assemble_result
+from rigidfleet.simulation.sampling import Sampling
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.live import balls
 from rigidfleet.web.live.archive import Archive, take_samples
@@ -338,14 +339,11 @@ class Pilot:
         if self.flight.begin(phase):
             self.commanded.append(phase)
 
-    def _sample_times(self, _plan: PhasePlan, t: float, t_end: float, **_: Any) -> Floats:
+    def _sample_times(self, plan: PhasePlan, t: float, t_end: float, **_: Any) -> Floats:
         """Multiples of the archive's step in (t, t_end], the end, and the start of a phase."""
-        step = self.archive.step
-        low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
-        grid = np.arange(low, high) * step
         begun = any(key[0] == len(self.flight.phases) - 1 for key in self.archive.phases)
-        start = [] if begun else [t and np.nextafter(t, math.inf)]
-        return np.concatenate([start, grid[grid < t_end - 1e-9], [t_end]])
+        sampling = Sampling(self.archive.step)
+        return sampling.times_between(plan, t, t_end, first=not begun, stop=t_end)
 
     def _positions(self) -> Floats:
         """Positions (N, 3) [m] of the vehicles."""

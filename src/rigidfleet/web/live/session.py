@@ -22,12 +22,18 @@ from rigidfleet.web.live.balls import AT_ONCE, LARGEST, QUICKEST, SMALLEST
 from rigidfleet.web.live.guarding import with_avoidance_or_reason
 from rigidfleet.web.live.pilot import TICK, Pilot
 from rigidfleet.web.replay.page import asset_text, page
-from rigidfleet.web.replay.scene import describe_scene, mean_weight, page_samples, scene_points
+from rigidfleet.web.replay.scene import (
+    EDGES,
+    describe_phases,
+    describe_scene,
+    mean_weight,
+    page_samples,
+    scene_points,
+)
 
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 #: Full colour of an edge, as a share of a vehicle's weight.
 _TENSION = 0.2
-_EDGES = 3000  # greatest number of edges drawn
 _AROUND = 20.0  # least range around the start that the overview shows, with nearby obstacles [m]
 _LATE = 0.3  # greatest delay that is made up for [s]
 #: Time after the last page is closed in which another may be opened [s].
@@ -51,7 +57,7 @@ class Session:
         self.landed = landed
         self.flown: Result | None = None  # the last flight that ended
         self.farewell = ""
-        self.shown = np.arange(min(len(mission.edges), _EDGES))
+        self.shown = np.arange(min(len(mission.edges), EDGES))
         self.tension = _TENSION * mean_weight(mission)
         self.lock = threading.RLock()
         self.pages: set[queue.Queue[bytes | None]] = set()
@@ -112,10 +118,7 @@ class Session:
         """Information that changes only now and then."""
         pilot = self.pilot
         return {
-            "phases": [
-                {"name": p.name, "start": p.t_start, "end": p.t_end, "position": None}
-                for p in pilot.flight.phases
-            ],
+            "phases": describe_phases(pilot.flight.phases),
             "ending": pilot.flight.ending,
             "formation": pilot.formation,
             "waiting": pilot.waiting,

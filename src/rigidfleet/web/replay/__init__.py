@@ -24,6 +24,8 @@ from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn, pack_columns
 from rigidfleet.web.replay.page import page
 from rigidfleet.web.replay.scene import (
+    EDGES,
+    describe_phases,
     describe_scene,
     mean_weight,
     page_samples,
@@ -37,7 +39,6 @@ _RATE = 30.0  # greatest sampling rate [Hz]; the page draws smooth curves throug
 #: Greatest number for all agents together; longer flights have a lower sampling rate.
 _SAMPLES = 3_000_000
 _HEIGHT = 600  # height in a notebook [px]
-_EDGES = 3000  # greatest number of edges drawn; more would hide the vehicles
 #: Number of vehicles beyond which each is a dot, unless it is near; columns that dots do without.
 _SWARM, _SHAPES = 3000, ("thrust", "turn", "rotors", "slot", "fall", "doubt")
 #: Least and greatest tension that the full colour of an edge stands for, as a share of a vehicle's weight.
@@ -149,10 +150,10 @@ def _interpolate(result: Result, values: Floats, time: Floats) -> Floats:
 
 def _indices_of_drawn_edges(result: Result) -> Ints:
     """Indices of the edges drawn: all, or the shortest if there are too many."""
-    if len(result.edges) <= _EDGES:
+    if len(result.edges) <= EDGES:
         return np.arange(len(result.edges))
     typical = np.median(result.distance[:: max(1, len(result.time) // 50)], axis=0)
-    return np.sort(np.argsort(typical, kind="stable")[:_EDGES])
+    return np.sort(np.argsort(typical, kind="stable")[:EDGES])
 
 
 def _page_information(result: Result, time: Floats) -> dict[str, Any]:
@@ -166,15 +167,7 @@ def _page_information(result: Result, time: Floats) -> dict[str, Any]:
     story = {
         "start": float(time[0]),
         "step": float(time[1] - time[0]) if len(time) > 1 else 0.0,
-        "phases": [
-            {
-                "name": phase.name,
-                "start": phase.t_start,
-                "end": phase.t_end,
-                "position": (phase.target or {}).get("position"),
-            }
-            for phase in result.phases
-        ],
+        "phases": describe_phases(result.phases),
         "ending": "" if result.complete else result.ending or "stopped",
         "camera": "overview",
         "sight": seen[8:],  # in addition to the flight itself

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,8 +22,9 @@ from rigidfleet.web.replay.pack import PackedColumn
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission, Obstacle
     from rigidfleet.mission.fences import Area
-    from rigidfleet.result import Result
+    from rigidfleet.result import PhaseRecord, Result
 
+EDGES = 3000  # greatest number of edges drawn; more would hide the vehicles
 _LINES = 12  # greatest number of lines in a plot; for more agents, the least and the greatest value
 #: Greatest number of obstacles that an overview fits one by one; more are fitted together.
 _BOXES = 200
@@ -57,6 +58,14 @@ def describe_scene(result: Result, shown_edges: Ints, max_tension: float) -> dic
         "solid": bool(np.isfinite(mission.ground)),
         "plots": [plot for plot, _ in _plots(result)],
     }
+
+
+def describe_phases(phases: Sequence[PhaseRecord]) -> list[dict[str, Any]]:
+    """Name, start and end [s] of each phase, and its goal [m]."""
+    return [
+        {"name": p.name, "start": p.t_start, "end": p.t_end, "position": (p.target or {}).get("position")}
+        for p in phases
+    ]  # fmt: skip
 
 
 def is_plain_box(thing: Obstacle) -> bool:
