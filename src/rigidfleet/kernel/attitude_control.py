@@ -15,7 +15,7 @@ from rigidfleet.kernel.rigid_body import attitude_matrix
 # Least vertical part of a force whose tilt is limited, as a share of the weight: a force downwards has no tilt to keep.
 _LEAST_LIFT = 0.05
 
-_speed = jit_inline(speed_of)
+rotor_speed = jit_inline(speed_of)
 
 
 @jit
@@ -154,7 +154,7 @@ def allocate_rotors(thrust, tau, B, least, most, f):
 def rotor_speeds(f, curve, limits, out):
     """Speeds out (4,) [rad/s] of rotors with forces f (4,) [N], within limits (2,), by their thrust curve (3,)."""
     for j in range(4):
-        out[j] = min(max(_speed(f[j], curve[0], curve[1], curve[2]), limits[0]), limits[1])
+        out[j] = min(max(rotor_speed(f[j], curve[0], curve[1], curve[2]), limits[0]), limits[1])
 
 
 @jit

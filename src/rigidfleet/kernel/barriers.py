@@ -75,7 +75,7 @@ def weaken_all_edge_forces(p, w, state, avoid):
 def add_barrier(count, i, j, entry, n, missing_accel, limit, avoid):
     """Add a barrier along n (3,), with its entry of ``last``; returns the number of them.
 
-    It changes the acceleration along n by twice ``limit_thrust`` at most.
+    It changes the acceleration along n by twice ``limit`` [m/s^2] at most.
     """
     if count < avoid.rows.shape[0]:
         avoid.rows[count, 0], avoid.rows[count, 1], avoid.rows[count, 2] = i, j, entry
@@ -291,18 +291,17 @@ def matrix_entry(i, j, n_ij, k, l, n_kl, avoid):
 def solve_active_set(count, p, w, avoid):
     """Solve exactly for the barriers that push less than they may, and the edges, if the sweeps have found which.
 
-    Returns whether the solution is one: no push is negative, and no other barrier violated.
+    Nothing changes if there are too many, or if the solution is none: a push that is negative, or greater than it may
+    be.
     """
     size, m = 0, p.graph.edges.shape[0]
     for k in range(count):
         if 0.0 < avoid.push[k] < avoid.most[k]:
             if size + m >= MOST_ROWS:
-                return False
+                return
             avoid.active[size] = k
             size += 1
     whole = size + m
-    if whole == 0:
-        return False
     # The unknowns are corrections of pushes, then of pulls. A push at a bound stays: the sweeps have chosen it.
     for row in range(whole):
         i, j, n = pair_and_normal_of_row(row, size, p, w, avoid)
@@ -318,12 +317,12 @@ def solve_active_set(count, p, w, avoid):
             avoid.system[row, row] += soft
             avoid.right[row] -= soft * avoid.pull[row - size]
     if not cholesky(avoid.system[:whole, :whole]):
-        return False
+        return
     cholesky_solve(avoid.system[:whole, :whole], avoid.right[:whole])
     for row in range(size):
         push = avoid.push[avoid.active[row]] + avoid.right[row]
         if not 0.0 <= push <= avoid.most[avoid.active[row]]:
-            return False
+            return
     for row in range(whole):
         i, j, n = pair_and_normal_of_row(row, size, p, w, avoid)
         apply_force(i, j, n, avoid.right[row], avoid)
@@ -331,7 +330,6 @@ def solve_active_set(count, p, w, avoid):
             avoid.push[avoid.active[row]] += avoid.right[row]
         else:
             avoid.pull[row - size] += avoid.right[row]
-    return True
 
 
 @jit

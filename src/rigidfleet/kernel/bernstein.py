@@ -284,15 +284,10 @@ def least_height_in_cylinder(reach, to_beat, pieces):
             along = min(along, x * piece[3 * k] + y * piece[3 * k + 1])
             low, high = min(low, piece[3 * k + 2]), max(high, piece[3 * k + 2])
         apart = along > reach * math.sqrt(x * x + y * y)
-        bound = max(0.0, low, -high)
-        if apart or not bound < best - close:
-            top -= 1
-        elif piece[16] <= _SHORTEST or count > _MOST:  # at the limit of an overlap: count it as one
-            best, at = bound, piece[15]
-            top -= 1
-        else:
-            halve_curve(piece, pieces[top + 1])
-            top += 1
+        bound = math.inf if apart else max(0.0, low, -high)
+        if bound < best - close and piece[16] <= _SHORTEST:
+            best, at = bound, piece[15]  # at the limit of an overlap: count it as one
+        best, at, top = halve_or_prune_piece(bound, best, at, close, count, top, pieces)
     return best, at
 
 

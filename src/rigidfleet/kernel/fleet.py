@@ -46,11 +46,6 @@ def speed_of(thrust, k0, k1, k2):
     return (np.sqrt(np.maximum(0.0, k1 * k1 + 4.0 * k2 * (thrust - k0))) - k1) / (2.0 * k2)
 
 
-def _as_three_floats(values: ArrayLike) -> tuple[float, float, float]:
-    a, b, c = np.asarray(values, dtype=float).tolist()
-    return a, b, c
-
-
 @dataclass(frozen=True)
 class VehicleDynamics:
     """One quadrotor, or one ideal point.
@@ -92,11 +87,11 @@ class VehicleDynamics:
 
     def rotor_thrust_at(self, speed: ArrayLike) -> Floats:
         """Thrust [N] of a rotor at a speed [rad/s]."""
-        return thrust_of(np.asarray(speed, dtype=float), *_as_three_floats(self.thrust))
+        return thrust_of(np.asarray(speed, dtype=float), *np.asarray(self.thrust, dtype=float))
 
     def rotor_speed_at(self, thrust: ArrayLike) -> Floats:
         """Speed [rad/s] of a rotor with a thrust [N]."""
-        return speed_of(np.asarray(thrust, dtype=float), *_as_three_floats(self.thrust))
+        return speed_of(np.asarray(thrust, dtype=float), *np.asarray(self.thrust, dtype=float))
 
     def wrench_to_rotors(self, g: float) -> Floats:
         """Matrix (4, 4) from thrust [N] and torque [N m] to the rotors' forces.
@@ -106,7 +101,8 @@ class VehicleDynamics:
         if self.point:
             return np.zeros((4, 4))
         hover = self.rotor_speed_at(0.25 * self.m * g or 0.5 * self.rotor_thrust_at(self.speed)[1])
-        ratio = thrust_of(hover, *_as_three_floats(self.torque)) / self.rotor_thrust_at(hover)
+        torque = thrust_of(hover, *np.asarray(self.torque, dtype=float))
+        ratio = torque / self.rotor_thrust_at(hover)
         rotors, spin = np.asarray(self.rotors, dtype=float), np.asarray(self.spin, dtype=float)
         mixing = np.stack([np.ones(4), rotors[:, 1], -rotors[:, 0], ratio * spin])
         if np.linalg.matrix_rank(mixing) < 4:
@@ -257,7 +253,7 @@ class SampledState(NamedTuple):
     seen: Floats  # (N, 6) measured r, v
     history: Floats  # (D, N, 6) true r, v of the last ticks
     mail: Mail
-    tau: Floats  # (N, 9) each vehicle's own clock, see `clock_records.OFF`
+    tau: Floats  # (N, 18) each vehicle's own clock, see `clock_records.OFF`
     peak: Floats  # (N, 4) greatest thrust of each rotor [N]
     peak_time: Floats  # (N, 4) [s]
     worst: Floats  # (N, 7) see `UPRIGHT`

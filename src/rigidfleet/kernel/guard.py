@@ -30,9 +30,8 @@ from rigidfleet.kernel.avoidance import (
     TICKS,
 )
 from rigidfleet.kernel.barriers import filter_accelerations, limit_thrust, weaken_all_edge_forces
-from rigidfleet.kernel.compiler.jit import jit, jit_inline
+from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
-from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.linalg import copy, copy_vector
 from rigidfleet.kernel.moving import (
     is_obstacle_known,
@@ -45,6 +44,7 @@ from rigidfleet.kernel.moving import (
     write_braking_relative_to_obstacle,
     write_stop_relative_to_obstacle,
 )
+from rigidfleet.kernel.quadrotor import rotor_curve
 from rigidfleet.kernel.rigid_body import attitude_matrix
 from rigidfleet.kernel.sampled_flight import write_measured_r_and_v
 from rigidfleet.kernel.segments import (
@@ -61,8 +61,6 @@ from rigidfleet.kernel.segments import (
 _FASTER, _LEAST_SPEED, _NEARER, _LEAST_WAY = 0.25, 0.2, 0.15, 0.2
 #: Shortfall of a distance from which a vehicle evades what moves as well as it can, and that counts as rounding [m].
 _LATE, _ROUNDING = 0.05, 1e-9
-
-_curve = jit_inline(thrust_of)
 
 
 # -- what a vehicle does -------------------------------------------------------------------------------
@@ -112,10 +110,9 @@ def commit_trial(i, far, avoid):
     """Make the candidate ``trial`` the present choice of vehicle i."""
     trial = avoid.trial
     avoid.far[i] = far
-    for q in range(3):
-        for k in range(3):
-            avoid.ways[i, k, q] = trial[k, q]
-        avoid.chosen[i, q], avoid.rise[i, q] = trial[3, q], trial[4, q]
+    copy(trial[:3], avoid.ways[i])
+    copy_vector(trial[3], avoid.chosen[i])
+    copy_vector(trial[4], avoid.rise[i])
 
 
 @jit
@@ -542,7 +539,7 @@ def move_to_lag_free_point(i, vehicles, state, r, v, avoid):
     attitude_matrix(S[6:10], T)
     lift, k = 0.0, vehicles.thrust[i]
     for j in range(4):
-        lift += _curve(S[13 + j], k[0], k[1], k[2]) / avoid.weight[i]
+        lift += rotor_curve(S[13 + j], k[0], k[1], k[2]) / avoid.weight[i]
     for q in range(3):
         a1, a2, late, u = ahead[q, 0], ahead[q, 1], ahead[q, 2], avoid.commanded[i, q]
         rise = lift * T[2, q] - (avoid.g if q == 2 else 0.0)

@@ -322,10 +322,9 @@ def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
     """Least of sign r[axis] - offset over a curve (5, 3)."""
     work, bound = monitor.work, math.inf
     for k in range(5):
-        bound = min(bound, sign * curve[k, axis] - offset)
+        work[0, k] = sign * curve[k, axis] - offset
+        bound = min(bound, work[0, k])
     if bound < monitor.worst[kind] - ACCURACY:
-        for k in range(5):
-            work[0, k] = sign * curve[k, axis] - offset
         value, at = least_polynomial_value(work, 4, monitor.worst[kind])
         if at >= 0.0:
             store_if_worse(kind, value, t + at * h, i, -1, monitor)
@@ -651,8 +650,7 @@ def watch_forces(is_last, p, w, state, monitor):
         after = trail.gauge[row]
         earlier = trail.gauge[trail_row_of(step - 1, state)] if step > 0 else before
         if step == 0 and new:
-            for c in range(before.shape[0]):
-                before[c] = trail.start[c]
+            copy_vector(trail.start, before)
             update_force_extremes(before, start, p, monitor)
         if new:
             update_force_extremes(after, end, p, monitor)
@@ -673,8 +671,6 @@ def watch_forces(is_last, p, w, state, monitor):
 def keep_only_last_step(steps, state, monitor):
     """Leave the last of the ``steps`` alone in the trail, and keep the forces at the end of the one before it."""
     if steps > 1:
-        before = state.trail.gauge[trail_row_of(steps - 2, state)]
-        for c in range(before.shape[0]):
-            monitor.gauge[0, c] = before[c]
+        copy_vector(state.trail.gauge[trail_row_of(steps - 2, state)], monitor.gauge[0])
     state.count[FIRST_ROW] = trail_row_of(steps - 1, state)
     monitor.count[STAYED], state.count[TRAILED] = 1, 1

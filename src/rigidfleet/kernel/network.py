@@ -5,6 +5,7 @@ and the tick: the same link loses the same messages whatever happens elsewhere.
 """
 
 from rigidfleet.kernel.compiler.jit import jit
+from rigidfleet.kernel.linalg import copy_vector
 from rigidfleet.kernel.mail import HEARD, LOST, NONE, SENT
 
 #: Kinds of random numbers.
@@ -78,9 +79,7 @@ def receive(k, net, mail):
         if stamp <= mail.stamp[l]:
             continue
         mail.stamp[l], mail.fresh[l], then = stamp, True, stamp % depth
-        for q in range(mail.heard.shape[1]):
-            mail.heard[l, q] = mail.post[then, net.links[l, 1], q]
-            mail.own[l, q] = mail.post[then, net.links[l, 0], q]
-        for q in range(mail.theirs.shape[1]):
-            mail.theirs[l, q] = mail.posted[then, net.reverse[l], q]
-            mail.ours[l, q] = mail.posted[then, l, q]
+        copy_vector(mail.post[then, net.links[l, 1]], mail.heard[l])
+        copy_vector(mail.post[then, net.links[l, 0]], mail.own[l])
+        copy_vector(mail.posted[then, net.reverse[l]], mail.theirs[l])
+        copy_vector(mail.posted[then, l], mail.ours[l])

@@ -14,6 +14,7 @@ import math
 from rigidfleet.kernel.bernstein import ball_radius, distance_to_box, point_at
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import compiled_copy, jit
+from rigidfleet.kernel.linalg import copy_vector
 from rigidfleet.kernel.monitor import (
     clearance_to_beat,
     count_pieces,
@@ -84,8 +85,7 @@ def cut_curve(curve, start, end, work, out):
     """Control points (5, 3) of the part of a curve between two places, by its blossom."""
     for k in range(5):
         for q in range(3):
-            for i in range(5):
-                work[i] = curve[i, q]
+            copy_vector(curve[:, q], work)
             for level in range(4):
                 x = end if level < k else start
                 for i in range(4 - level):

@@ -18,7 +18,7 @@ from rigidfleet.solids.distance import top_of_solids_below
 #: Rows of `SampledWork.y`.
 _START, _TRIAL, _RATES, _END = 0, 1, 2, 6
 
-_curve = jit_inline(thrust_of)
+rotor_curve = jit_inline(thrust_of)
 
 
 @jit
@@ -85,11 +85,11 @@ def write_quadrotor_derivative(y, command, i, vehicles, around, air, push, T, dy
             w, spin = y[13 + j], vehicles.spin[i, j]
             u0, u1, u2 = b0 + Q * x2 - R * x1, b1 + R * x0 - P * x2, b2 + P * x1 - Q * x0
             h0, h1 = -k_d * w * u0, -k_d * w * u1
-            h2 = _curve(w, k0, k1, k2) + k_h * (u0 * u0 + u1 * u1) - k_z * w * u2
+            h2 = rotor_curve(w, k0, k1, k2) + k_h * (u0 * u0 + u1 * u1) - k_z * w * u2
             F0, F1, F2 = F0 + h0, F1 + h1, F2 + h2
             M0 += x1 * h2 - x2 * h1
             M1 += x2 * h0 - x0 * h2
-            M2 += x0 * h1 - x1 * h0 + spin * _curve(w, c0, c1, c2)
+            M2 += x0 * h1 - x1 * h0 + spin * rotor_curve(w, c0, c1, c2)
             error = command[j] - w
             up = error > 0.0
             linear = vehicles.motor[i, 0] if up else vehicles.motor[i, 2]

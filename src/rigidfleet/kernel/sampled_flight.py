@@ -9,7 +9,7 @@ are evaluated at each stage, a user's force in the middle of each step, downwash
 import math
 
 from rigidfleet.kernel.aerodynamics import add_downwash_to_air, write_air_velocity_in_step
-from rigidfleet.kernel.attitude_control import command_rotors
+from rigidfleet.kernel.attitude_control import command_rotors, rotor_speed
 from rigidfleet.kernel.clock_records import OFF, RATE, SLOPE
 from rigidfleet.kernel.clocks import (
     advance_clocks,
@@ -18,8 +18,7 @@ from rigidfleet.kernel.clocks import (
     write_slots_by_own_clock,
     zero_own_constraint_force,
 )
-from rigidfleet.kernel.compiler.calls import call_external, call_recorder
-from rigidfleet.kernel.compiler.jit import jit, jit_inline
+from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.control import local_law
 from rigidfleet.kernel.fleet import (
     ACCELERATION,
@@ -39,8 +38,6 @@ from rigidfleet.kernel.fleet import (
     TRAILED,
     UPRIGHT,
     VERTICAL,
-    speed_of,
-    thrust_of,
 )
 from rigidfleet.kernel.linalg import copy, copy_vector
 from rigidfleet.kernel.mail import NONE, PULL, SATURATED, SLOT, TRACKED, A, R, U, V
@@ -51,8 +48,9 @@ from rigidfleet.kernel.neighbours import (
     solve_own_constraint_force,
 )
 from rigidfleet.kernel.network import receive, send
+from rigidfleet.kernel.outside import call_external, call_recorder
 from rigidfleet.kernel.problem import SHAPE
-from rigidfleet.kernel.quadrotor import normalise_quaternion, runge_kutta
+from rigidfleet.kernel.quadrotor import normalise_quaternion, rotor_curve, runge_kutta
 from rigidfleet.kernel.records import ASKS, COLLAPSED, FINISHED, PAUSED
 from rigidfleet.kernel.references import blend_slots, distance_references
 from rigidfleet.kernel.rigid_body import (
@@ -66,17 +64,8 @@ from rigidfleet.kernel.rigid_body import (
 #: Times that differ by less than this share of a step are the same.
 _SAME = 1e-9
 
-_curve = jit_inline(thrust_of)
-_speed = jit_inline(speed_of)
-
 
 # -- what is known -------------------------------------------------------------------------------------
-
-
-@jit
-def tick_row(k, every, first):
-    """Row of a table for the measurement at tick k, if the table begins with tick ``first``."""
-    return k // every - (first + every - 1) // every
 
 
 @jit
@@ -98,7 +87,8 @@ def measure_states(k, flight, state):
         for q in range(6):
             state.history[now, i, q] = state.S[i, q] - path_coordinate(k, i, q, tables)
     if k % sensing.every == 0:
-        u = tick_row(k, sensing.every, tables.first)
+        # The tables begin with the first measurement at or after their first tick.
+        u = k // sensing.every - (tables.first + sensing.every - 1) // sensing.every
         noisy = tables.noise_r.shape[0] > 0
         for i in range(n):
             if tables.dropped.shape[0] > 0 and tables.dropped[u, i]:
@@ -114,28 +104,27 @@ def measure_states(k, flight, state):
 
 
 @jit
-def evaluate_law(k, t, known, integral, p, w, flight, state, call):
-    """Evaluate the formation law at tick k, time t [s], for known states (N, 6) and an integral (m,); results in w."""
-    n, m, y = known.shape[0], integral.shape[0], state.work.law_state[0]
+def evaluate_law(k, t, p, w, flight, state, call):
+    """Evaluate the formation law at tick k, time t [s], for the states that are known; results in w."""
+    known, y = state.seen, state.work.law_state[0]
+    n, m = known.shape[0], state.integral.shape[0]
     for i in range(n):
         for q in range(3):
             y[3 * i + q] = known[i, q] + path_coordinate(k, i, q, flight.tables)
             y[3 * n + 3 * i + q] = known[i, 3 + q] + path_coordinate(k, i, 3 + q, flight.tables)
-    for c in range(m):
-        y[6 * n + c] = integral[c]
-    for q in range(4):
-        y[6 * n + m + q] = state.frame[0, q]
+    copy_vector(state.integral, y[6 * n :])
+    copy_vector(state.frame[0], y[6 * n + m :])
     state.work.law_time[0] = t
     call_recorder(call.recorder, p, w, call.segment, call.record)
 
 
 @jit
-def integrate_constraints(dt, integral, p, w, state):
-    """Add c dt to the integral (m,) of each constraint, unless a vehicle of its edge is saturated."""
+def integrate_constraints(dt, p, w, state):
+    """Add c dt to the integral of each constraint, unless a vehicle of its edge is saturated."""
     edges = p.graph.edges
     for k in range(edges.shape[0]):
         if not (state.saturated[edges[k, 0]] or state.saturated[edges[k, 1]]):
-            integral[k] += dt * w.c[k]
+            state.integral[k] += dt * w.c[k]
 
 
 @jit
@@ -152,7 +141,7 @@ def compensate_drag(i, v, share, vehicles, state):
     if not vehicles.point[i]:
         load = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
         k0, k1, k2 = vehicles.thrust[i, 0], vehicles.thrust[i, 1], vehicles.thrust[i, 2]
-        rotors = 4.0 * _speed(0.25 * load, k0, k1, k2)  # sum of their speeds
+        rotors = 4.0 * rotor_speed(0.25 * load, k0, k1, k2)  # sum of their speeds
         across, along = vehicles.rotor_drag[i, 0] * rotors, vehicles.rotor_drag[i, 1] * rotors
     for q in range(3):
         rotor = across if q < 2 else along
@@ -280,8 +269,7 @@ def prepare_messages(k, p, w, flight, state):
         message[TRACKED] = 1.0 if p.control.tracks_slots else 0.0
         message[SATURATED] = 1.0 if state.saturated[i] else 0.0
         post_clock(k, i, flight.clocks, state.tau[i], message)
-        for q in range(mail.pull.shape[1]):
-            message[PULL + q] = mail.pull[i, q]
+        copy_vector(mail.pull[i], message[PULL:])
     copy(mail.multiplier, mail.posted[row])
 
 
@@ -313,19 +301,18 @@ def decide_broadcasts(k, p, w, flight, state):
 @jit
 def find_desired_forces(k, t, p, w, flight, state, call):
     """Desired forces of all vehicles at tick k, time t [s]; returns False if there are none (a singular law)."""
-    n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
+    dt = flight.every * flight.steps * flight.h
     advance_frame(t, p, state)
     if flight.network.every > 0:
         evaluate_distributed_law(k, t, dt, p, w, flight, state)
     else:
-        evaluate_law(k, t, state.seen, state.integral, p, w, flight, state, call)
-        integrate_constraints(dt, state.integral, p, w, state)
-        for i in range(n):
+        evaluate_law(k, t, p, w, flight, state, call)
+        integrate_constraints(dt, p, w, state)
+        for i in range(state.S.shape[0]):
             write_desired_force(k, i, dt, p, w, flight, state)
     if p.has_frame:
-        for i in range(n):
-            for q in range(3):
-                w.r[i, q], w.v[i, q] = state.S[i, q], state.S[i, 3 + q]
+        copy(state.S[:, :3], w.r)
+        copy(state.S[:, 3:6], w.v)
         mean_axes(w.r, w.v, p.vehicles.m, p.vehicles.M, w)
         multiply(w.T, w.cm[2], w.cm[4])
         copy_vector(state.frame[1], state.frame[2])
@@ -353,18 +340,12 @@ def advance_frame(t, p, state):
 
 
 @jit
-def receive_messages(k, flight, state):
-    """Take the messages that arrive at tick k, and advance the clocks to it."""
-    if flight.clocks.own:
-        advance_clocks(k, flight.steps * flight.h, flight, state)
-    receive(k, flight.network, state.mail)
-
-
-@jit
 def measure_and_command_rotors(k, t, p, w, flight, state, call):
     """Measure, desire and steer at tick k, time t [s]; returns False if the law gives no force."""
     if flight.network.every > 0:
-        receive_messages(k, flight, state)
+        if flight.clocks.own:
+            advance_clocks(k, flight.steps * flight.h, flight, state)
+        receive(k, flight.network, state.mail)
     measure_states(k, flight, state)
     due = flight.commands.kind in (FORCE, OWN) and k % flight.every == 0
     if due and not find_desired_forces(k, t, p, w, flight, state, call):
@@ -389,8 +370,7 @@ def advance_states(start, h, flight, state):
     """Advance all vehicles by h [s] in ``work.y``, from states ``start`` (N, 17) to row 6."""
     work = state.work
     for i in range(start.shape[0]):
-        for q in range(17):
-            work.y[0, 17 * i + q] = start[i, q]
+        copy_vector(start[i], work.y[0, 17 * i :])
     runge_kutta(h, state.command, flight.vehicles, flight.air, state.push, work)
 
 
@@ -420,8 +400,7 @@ def write_derivatives(sample, t, p, flight, state, call):
     find_air_and_push(t, 0.0, call.S[sample], p, flight, state)
     advance_states(call.S[sample], 0.0, flight, state)
     for i in range(state.S.shape[0]):
-        for q in range(17):
-            call.dS[sample, i, q] = state.work.y[2, 17 * i + q]
+        copy_vector(state.work.y[2, 17 * i : 17 * i + 17], call.dS[sample, i])
 
 
 @jit
@@ -437,8 +416,7 @@ def write_samples(t, h, p, flight, state, call):
         find_air_and_push(t, x, state.S, p, flight, state)
         advance_states(state.S, x, flight, state)
         for i in range(state.S.shape[0]):
-            for q in range(17):
-                call.S[c, i, q] = work.y[6, 17 * i + q]
+            copy_vector(work.y[6, 17 * i : 17 * i + 17], call.S[c, i])
             copy_vector(state.command[i], call.command[c, i])
             for q in range(3):
                 call.f_u[c, i, q], call.f_C[c, i, q] = state.f_u[i, q], state.f_C[i, q]
@@ -501,7 +479,7 @@ def update_extremes(i, t, h, vehicles, state):
         return
     for j in range(4):
         w = end[13 + j]
-        force = _curve(w, vehicles.thrust[i, 0], vehicles.thrust[i, 1], vehicles.thrust[i, 2])
+        force = rotor_curve(w, vehicles.thrust[i, 0], vehicles.thrust[i, 1], vehicles.thrust[i, 2])
         load += force
         if force > state.peak[i, j]:
             state.peak[i, j], state.peak_time[i, j] = force, t + h
@@ -530,8 +508,7 @@ def advance_fleet(t, h, p, flight, state):
             update_extremes(i, t, h, flight.vehicles, state)
         if kept:
             write_step_curve(i, h, state.work, trail.points[row])
-        for q in range(17):
-            state.S[i, q] = state.work.y[6, 17 * i + q]
+        copy_vector(state.work.y[6, 17 * i : 17 * i + 17], state.S[i])
     return True
 
 

@@ -1,5 +1,6 @@
 """Calls by address from compiled code: a user's force, the solver of a large formation, the recorder."""
 
+from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
@@ -7,7 +8,6 @@ from numba.extending import intrinsic
 @intrinsic
 def call_external(_context, address, t, r, v, f):
     """Call the C function at ``address``: void(double t, double *r, *v, *f, ssize_t n)."""
-    from llvmlite import ir
 
     def generate(context, builder, signature, arguments):
         pointer, double, size = ir.IntType(8).as_pointer(), ir.DoubleType(), ir.IntType(64)
@@ -27,7 +27,6 @@ def call_external(_context, address, t, r, v, f):
 @intrinsic
 def call_solver(_context, address):
     """Call the C function at ``address``: void()."""
-    from llvmlite import ir
 
     def generate(context, builder, signature, arguments):
         kind = ir.FunctionType(ir.VoidType(), [])
@@ -43,7 +42,6 @@ def call_recorder(_context, address, p, w, segment, record):
 
     Avoidance in flight is called in the same way: int64(flight, state, avoidance, 0).
     """
-    from llvmlite import ir
 
     def generate_recorder_call(context, builder, signature, arguments):
         word = ir.IntType(64)

@@ -23,13 +23,13 @@ from numba.extending import (
     lower_builtin,
     lower_cast,
     models,
-    overload,
     register_model,
     typeof_impl,
 )
 from numpy.typing import NDArray
 
 from rigidfleet.kernel.compiler import jit  # noqa: F401 -- sets for which processor Numba compiles
+from rigidfleet.kernel.problem import zeros
 from rigidfleet.typing import Floats
 
 #: Number of lanes of a value.
@@ -86,10 +86,7 @@ def pack_lanes(values: Floats) -> LaneArray:
 
 def empty_lanes(shape: tuple[int, ...]) -> LaneArray:
     """An array of lanes with any numbers, aligned for vectors."""
-    size = WIDTH * math.prod(shape)
-    memory = np.empty(size + WIDTH)
-    skip = -memory.__array_interface__["data"][0] // memory.itemsize % WIDTH
-    return memory[skip : skip + size].view(_KIND).reshape(shape).view(LaneArray)
+    return zeros(math.prod(shape) * WIDTH).view(_KIND).reshape(shape).view(LaneArray)
 
 
 def unpack_lanes(array: NDArray[Any]) -> Floats:
@@ -316,8 +313,8 @@ def as_lanes(_context, array):
 
 
 @intrinsic
-def _sum_or_largest_lane(_context, x, largest):
-    """Sum over the lanes, or the largest one; NaN if any lane is NaN."""
+def sum_lanes_or_worst_flight(_context, x, states):
+    """Sum over the lanes of x if ``states`` belong to one flight; otherwise the value of the worst flight, or NaN."""
 
     def generate(_context: Any, builder: Any, _sig: Any, args: Any) -> ir.Value:
         def combine_halves(x: ir.Value, combine: Any) -> ir.Value:
@@ -332,21 +329,9 @@ def _sum_or_largest_lane(_context, x, largest):
             return builder.extract_element(x, ir.Constant(_INDEX, 0))
 
         total = combine_halves(args[0], builder.fadd)
+        if states.dtype != lanes:
+            return total
         most = combine_halves(args[0], partial(build_maximum, builder))
-        number = builder.fcmp_ordered("ord", total, total)
-        most = builder.select(number, most, total)
-        return builder.select(args[1], most, total)
+        return builder.select(builder.fcmp_ordered("ord", total, total), most, total)
 
-    return types.float64(x, types.boolean), generate
-
-
-def sum_lanes_or_worst_flight(x, states):
-    """Sum over the lanes of x if ``states`` belong to one flight; otherwise the value of the worst flight."""
-    raise NotImplementedError("compiled code only")
-
-
-@overload(sum_lanes_or_worst_flight)
-def _overload_lane_sum_or_worst(x, states):
-    if states.dtype == lanes:
-        return lambda x, states: _sum_or_largest_lane(x, True)
-    return lambda x, states: _sum_or_largest_lane(x, False)
+    return types.float64(x, states), generate

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from rigidfleet.kernel.engine.codegen import (
     unrolled,
     unrolled_together,
 )
+from rigidfleet.kernel.linalg import copy_vector
 from rigidfleet.kernel.problem import (
     EXACT,
     ITERATED,
@@ -31,7 +33,6 @@ from rigidfleet.kernel.problem import (
     TRACKING,
     Disturbance,
     Problem,
-    Reference,
     padded,
     workspace,
 )
@@ -71,17 +72,14 @@ def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, ma
     p, state = address_of(p), address_of(state)
     unsampled = state.clock[:0]
     for g in range(starts.shape[0]):
-        for q in range(starts.shape[1]):
-            state.y[q] = starts[g, q]
-        for k in range(before.shape[1]):
-            p.before[k] = before[g, k]
+        copy_vector(starts[g], state.y)
+        copy_vector(before[g], p.before)
         state.clock[TIME], state.clock[NEXT_STEP], state.clock[LAST_ERROR] = t0, step, LEAST_ERROR
         for q in range(TRAILED):
             state.count[q] = 0
         status[g] = integrate(p, p, state, t_end, fresh, unsampled, ends[:0], max_steps)
         evaluations[g] = state.count[EVALUATIONS]
-        for q in range(starts.shape[1]):
-            ends[g, q] = state.y[q]
+        copy_vector(state.y, ends[g])
 
 
 @jit
@@ -145,26 +143,19 @@ def can_unroll_together(problems: Sequence[Problem]) -> bool:
         not (x.has_frame or x.body_formulation or any(x.disturbance.lost.tolist()))
         and x.external.max_step == np.inf  # also of any force
         and len(x.reference.knots) == 0
-        and x.vehicles.saturate == first.vehicles.saturate
-        and x.law.solver == first.law.solver
-        and x.law.iterations == first.law.iterations
-        and x.control.kind == first.control.kind
-        and _blend_key(x.reference) == _blend_key(first.reference)
-        and _disturbance_key(x.disturbance) == _disturbance_key(first.disturbance)
+        and _sharing_key(x) == _sharing_key(first)
         and arrays_equal(x.graph.edges, first.graph.edges)
         and arrays_equal(x.motion.knots, first.motion.knots)
         for x in problems
     )
 
 
-def _blend_key(reference: Reference) -> tuple[int, float, float]:
-    return reference.kind, reference.t0, reference.T_b
-
-
-def _disturbance_key(x: Disturbance) -> tuple[object, ...]:
-    return (
-        x.active, x.gust.shape, x.noise_r.shape, x.noise_v.shape, x.gust_step, x.noise_step,
-    )  # fmt: skip
+#: What problems in common steps have in common, beside graph and knots: options, the blend, and sizes of tables.
+_sharing_key = attrgetter(
+    "vehicles.saturate", "law.solver", "law.iterations", "control.kind", "reference.kind", "reference.t0",
+    "reference.T_b", "disturbance.active", "disturbance.gust.shape", "disturbance.noise_r.shape",
+    "disturbance.noise_v.shape", "disturbance.gust_step", "disturbance.noise_step",
+)  # fmt: skip
 
 
 class Vector:
@@ -269,7 +260,7 @@ def fly_all(
     Raises
     ------
     ValueError
-        The problem does not fit vectors, see `fits`.
+        The flights cannot share vectors, see `can_unroll`.
     """
 
     def make_scalar_worker() -> Callable[..., None]:
@@ -332,7 +323,7 @@ def fly_all(
 def _fly_in_threads(
     begin: Callable[[], Callable[..., None]], starts: Floats, before: Floats, threads: int
 ) -> FinalStates:
-    """Distribute flights, or vectors of them, over threads; each thread calls `make_vector_worker` for its own data."""
+    """Distribute flights, or vectors of them, over threads; each thread calls ``begin`` for a worker of its own."""
     count = len(starts)
     threads = min(threads, count)
     ends = np.empty_like(starts)

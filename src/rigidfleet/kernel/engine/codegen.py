@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,10 +59,8 @@ class UnrolledProblem(NamedTuple):
     knots: Floats  # of the reference motion [s]
     motion: LaneArray  # (pieces, 36) its coefficients
     gust_step: float  # [s]
-    gust_rows: int
     gust: LaneArray  # (K, 3N)
     noise_step: float  # [s]
-    noise_rows: int
     noise_r: LaneArray  # (K, 3N)
     noise_v: LaneArray  # (K, 3N)
     samples: Ints  # (8,) addresses of each flight's samples
@@ -123,8 +121,7 @@ def gust_and_noise_tables(disturbances: Sequence[Disturbance]) -> dict[str, Any]
         )
         for name in ("gust", "noise_r", "noise_v")
     }
-    rows = {"gust_rows": len(first.gust), "noise_rows": len(first.noise_r)}
-    return {"gust_step": first.gust_step, "noise_step": first.noise_step, **rows, **tables}
+    return {"gust_step": first.gust_step, "noise_step": first.noise_step, **tables}
 
 
 def packed(parts: Sequence[Floats]) -> LaneArray:
@@ -155,7 +152,7 @@ def _prepare_unrolled(
     return UnrolledProblem(
         address, uniform, lanes(len(problem.graph.edges)), np.zeros(MOMENT + 1), lanes(len(code.known)),
         lanes(len(code.gauge)), np.zeros(1, dtype=np.int64), reference.t0, reference.T_b, np.zeros(0), none,
-        1.0, 0, none, 1.0, 0, none, none, np.zeros(WIDTH, dtype=np.int64),
+        1.0, none, 1.0, none, none, np.zeros(WIDTH, dtype=np.int64),
         np.zeros((len(lane_steps.TRAIL), WIDTH), dtype=np.int64), simd.empty_lanes((2, 5, 0)),
     )  # fmt: skip
 
@@ -201,10 +198,12 @@ def _closed_loop(t, y, dy, p, w):
         if p.motion.shape[0] > 0:
             piece, time[3], _ = piece_at(t, p.knots)
         if p.gust.shape[0] > 0:
-            gust, time[4], time[5], time[6], time[7] = spline_weights(t, p.gust_step, p.gust_rows)
+            gust, time[4], time[5], time[6], time[7] = spline_weights(
+                t, p.gust_step, p.gust.shape[0]
+            )
         if p.noise_r.shape[0] > 0:
             noise, time[8], time[9], time[10], time[11] = spline_weights(
-                t, p.noise_step, p.noise_rows
+                t, p.noise_step, p.noise_r.shape[0]
             )
     if stage == 0 or stage == lane_steps.STAGES - 1:  # the start, the middle and the end of a step
         wanted += OF_GAUGE
@@ -302,20 +301,19 @@ def _element_address(builder: ir.IRBuilder, array: ir.Value, index: int) -> ir.V
 def _symbol_evaluator(
     builder: ir.IRBuilder,
     load: Callable[[ir.IRBuilder, Symbol], ir.Value],
-    known: Sequence[Symbol] = (),
+    stored: Container[int] = (),
 ) -> Callable[[Symbol | float], ir.Value]:
     """A function that returns the value of a symbol whose arguments it has returned before.
 
-    Sources and the symbols ``known`` are loaded, at their first use.
+    Sources and the symbols of which the serials are ``stored`` are loaded, at their first use.
     """
     values: dict[int, ir.Value] = {}
-    loaded = {x.serial for x in known}
 
     def value(x: Symbol | float) -> ir.Value:
         if not isinstance(x, Symbol):
             return simd.lane_constant(x)
         if x.serial not in values:
-            if x.serial in loaded or x.operation in INPUTS:
+            if x.serial in stored or x.operation in INPUTS:
                 values[x.serial] = load(builder, x)
             else:
                 values[x.serial] = simd.BUILD[x.operation](builder, *map(value, x.arguments))
@@ -335,13 +333,12 @@ def _emit_code(module: ir.Module, code: Code) -> ir.Function:
     for argument in arrays:
         argument.add_attribute("noalias")
     y, dy, gauge, uniform, before, time, known, *rows = arrays
-    inputs = {x.serial: index for index, x in enumerate(code.inputs)}
-    shared = {x.serial: index for index, x in enumerate(code.known)}
+    stored = {x.serial: (uniform, index) for index, x in enumerate(code.inputs)}
 
     def load(builder: ir.IRBuilder, x: Symbol) -> ir.Value:
         match x.operation, *x.arguments:
-            case _ if x.serial in inputs:
-                array, index = uniform, inputs[x.serial]
+            case _ if x.serial in stored:
+                array, index = stored[x.serial]
             case "time", place:
                 number = builder.gep(time, [ir.Constant(ir.IntType(64), place)])
                 return simd.fill_vector(builder, builder.load(number))
@@ -351,12 +348,7 @@ def _emit_code(module: ir.Module, code: Code) -> ir.Function:
                 array = {"y": y, "before": before}[operation]
         return builder.load(_element_address(builder, array, index), align=8)
 
-    def load_known(builder: ir.IRBuilder, x: Symbol) -> ir.Value:
-        if x.serial in shared:
-            return builder.load(_element_address(builder, known, shared[x.serial]), align=8)
-        return load(builder, x)
-
-    names = "asked", "moment", "state", "gauge", "end"
+    names = "entry", "moment", "state", "gauge", "end"
     entry, of_moment, of_state, of_gauge, end = map(function.append_basic_block, names)
     bits = ir.IntType(64)
 
@@ -368,7 +360,7 @@ def _emit_code(module: ir.Module, code: Code) -> ir.Function:
 
     branch(ir.IRBuilder(entry), OF_MOMENT, of_moment, of_state)
     builder = ir.IRBuilder(of_moment)
-    value = _symbol_evaluator(builder, load, code.inputs)
+    value = _symbol_evaluator(builder, load, stored)
     for x in code.moment:
         value(x)
     for index, x in enumerate(code.known):
@@ -376,7 +368,8 @@ def _emit_code(module: ir.Module, code: Code) -> ir.Function:
     builder.branch(of_state)
 
     builder.position_at_end(of_state)
-    value = _symbol_evaluator(builder, load_known, code.inputs + code.known)
+    stored |= {x.serial: (known, index) for index, x in enumerate(code.known)}
+    value = _symbol_evaluator(builder, load, stored)
     for x in code.lines:
         value(x)
     whole = [builder.fcmp_ordered(">", value(x), simd.lane_constant(0.0)) for x in code.positive]
