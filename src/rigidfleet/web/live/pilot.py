@@ -22,7 +22,7 @@ from rigidfleet.planning.reference import Pose
 from rigidfleet.result import Result
 from rigidfleet.simulation.flight import Flight
 from rigidfleet.simulation.recording import assemble_result
-from rigidfleet.simulation.sampling import Sampling
+from rigidfleet.simulation.sampling import times_between
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.live import balls
 from rigidfleet.web.live.archive import Archive, take_samples
@@ -342,8 +342,7 @@ class Pilot:
     def _sample_times(self, plan: PhasePlan, t: float, t_end: float, **_: Any) -> Floats:
         """Multiples of the archive's step in (t, t_end], the end, and the start of a phase."""
         begun = any(key[0] == len(self.flight.phases) - 1 for key in self.archive.phases)
-        sampling = Sampling(self.archive.step)
-        return sampling.times_between(plan, t, t_end, first=not begun, stop=t_end)
+        return times_between(self.archive.step, plan, t, t_end, first=not begun, stop=t_end)
 
     def _positions(self) -> Floats:
         """Positions (N, 3) [m] of the vehicles."""
