@@ -8,7 +8,6 @@ from rigidfleet._common.renamed import getattr_of_earlier_names
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.dynamics import closed_loop
 from rigidfleet.kernel.gauge import write_watched_forces
-from rigidfleet.kernel.linalg import copy_vector
 from rigidfleet.kernel.records import (
     ACCEPTED,
     ATOL,
@@ -188,7 +187,8 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     K, clock, count = state.K, state.clock, state.count
     n, capacity = state.y.shape[0], state.trail.clock.shape[0]
     y, trial = K[STATE], K[TRIAL]
-    copy_vector(state.y, y)
+    for q in range(n):
+        y[q] = state.y[q]
     k = as_lanes(K)
     t, h, last = clock[TIME], clock[NEXT_STEP], clock[LAST_ERROR]
     if fresh:
@@ -240,7 +240,8 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
             break
         if capacity > 0 and count[TRAILED] + _TRAIL_ROWS > capacity:
             break
-    copy_vector(y[:n], state.y)
+    for q in range(n):
+        state.y[q] = y[q]
     clock[TIME], clock[NEXT_STEP], clock[LAST_ERROR] = t, h, last
     return status
 

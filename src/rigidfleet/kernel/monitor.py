@@ -322,9 +322,10 @@ def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
     """Least of sign r[axis] - offset over a curve (5, 3)."""
     work, bound = monitor.work, math.inf
     for k in range(5):
-        work[0, k] = sign * curve[k, axis] - offset
-        bound = min(bound, work[0, k])
+        bound = min(bound, sign * curve[k, axis] - offset)
     if bound < monitor.worst[kind] - ACCURACY:
+        for k in range(5):
+            work[0, k] = sign * curve[k, axis] - offset
         value, at = least_polynomial_value(work, 4, monitor.worst[kind])
         if at >= 0.0:
             store_if_worse(kind, value, t + at * h, i, -1, monitor)

@@ -75,8 +75,7 @@ def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, ma
         copy_vector(starts[g], state.y)
         copy_vector(before[g], p.before)
         state.clock[TIME], state.clock[NEXT_STEP], state.clock[LAST_ERROR] = t0, step, LEAST_ERROR
-        for q in range(TRAILED):
-            state.count[q] = 0
+        state.count[:TRAILED] = 0
         status[g] = integrate(p, p, state, t_end, fresh, unsampled, ends[:0], max_steps)
         evaluations[g] = state.count[EVALUATIONS]
         copy_vector(state.y, ends[g])
@@ -199,7 +198,6 @@ class Vector:
             samples=addresses(samples), trails=np.array(trails), halves=empty_lanes((2, 5, n))
         )
         K = empty_lanes((lane_steps.ROWS, n))
-        unpack_lanes(K)[: lane_steps.STAGES] = 0.0
         unpack_lanes(K)[lane_steps.ATOL] = np.stack(
             [state.K[ATOL, :n] for state in states], axis=-1
         )
