@@ -152,7 +152,7 @@ def test_an_attribute_of_another_type_is_damage(tmp_path, whole, name, value):
         (array("thrust", lambda x: np.float64(1.0)), "thrust has shape"),
         (lambda file: file.__delitem__("cm"), "cm is missing"),
         (entry("time", 3, np.nan), "time must be finite"),
-        (entry("phase", 0, 7), "phase has indices outside"),
+        (entry("phase", -1, 7), "phase has indices outside"),
         (array("phase", lambda x: x[::-1].copy()), "phase must not decrease"),
         (entry("edges", (0, 0), 9), "edges has agents outside"),
         (entry("edges", (0, 0), -1), "edges has agents outside"),

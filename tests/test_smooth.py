@@ -419,7 +419,7 @@ def test_a_time_that_is_too_short_is_refused_with_the_least_one():
     ]
     assert len(told) == 1
     found = re.fullmatch(
-        r"agent \d would need [\d.]+ m/s\^3 of jerk at [\d.]+ s in 'over there' \(limit 1.5 m/s\^3\); the least"
+        r"agent \d would need [\d.]+ m/s³ of jerk at [\d.]+ s in 'over there' \(limit 1.5 m/s³\); the least"
         r" duration of this phase is ([\d.]+) s",
         told[0],
     )
