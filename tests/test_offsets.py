@@ -6,7 +6,9 @@ import sys
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from test_legs import Draw
 
+from rigidfleet import MissionError
 from rigidfleet.assessment import assess
 from rigidfleet.math.pid import matrix_exponential
 from rigidfleet.mission import Mission
@@ -28,6 +30,7 @@ FORESEEN = {
     "geofence": ("geofence",),
     "formation": ("shape", "distances"),
     "settle": ("settled",),
+    "landing": ("touch_down",),
 }
 
 
@@ -219,6 +222,109 @@ def test_nothing_is_said_to_fail_that_passes(model):
         broken = failed(assess(simulate(blown)))
         for topic in foreseen(check(blown, search=False)):
             assert broken & set(FORESEEN[topic]), topic
+
+
+GROUND = [{"kind": "ground"}]
+LAND = {"kind": "land", "duration": 6.0}
+#: Errors of mass by which a landing ends in the ground, above it, or on it.
+LANDED = [(0.03, "obstacle"), (-0.03, "landing"), (0.004, ""), (-0.004, "")]
+
+
+@pytest.mark.parametrize("model", [None, "x500"])
+@pytest.mark.parametrize(("error", "what"), LANDED)
+def test_a_landing_with_a_wrong_mass_ends_where_a_check_says(error, what, model):
+    """In the ground, above it or on it, of points and of quadrotors."""
+    down = mission(TAKE, LAND, model=model, obstacles=GROUND, disturbances={"mass_error": error})
+    ahead, broken = foreseen(check(down, search=False)), failed(assess(simulate(down)))
+    assert {what} - {""} == ahead & {"obstacle", "landing"}
+    assert (what == "obstacle") == ("clearance" in broken)
+    assert (what == "landing") == ("touch_down" in broken)
+
+
+@pytest.mark.parametrize("error", [0.03, -0.03])
+def test_a_landing_in_a_ground_effect_is_not_foreseen_for_sure(error):
+    """Rotors near the ground give more thrust than a check knows: a note."""
+    d = {"mass_error": error, "ground_effect": True}
+    found = check(mission(TAKE, LAND, model="x500", obstacles=GROUND, disturbances=d), search=False)
+    assert not foreseen(found) & {"obstacle", "landing"}
+    assert any("in 'land 2'" in r.text for r in found.remarks if r.topic in ("obstacle", "landing"))
+
+
+@pytest.mark.parametrize("answer", ["abort", "land"])
+@pytest.mark.parametrize(("error", "what"), LANDED)
+def test_the_way_after_an_abort_or_a_loss_is_held_against_offsets(answer, error, what):
+    """The last landing misses the ground where a check says so; a phase that is abandoned promises nothing."""
+    lost = {"lost": [{"agent": 1, "time": 8.0}], "on_loss": "land"}
+    why = {"abort": {"abort": {"at": 8.0}}, "land": {}}[answer]
+    d = {"mass_error": error} | (lost if answer == "land" else {})
+    home = mission(TAKE, FLY, obstacles=GROUND, disturbances=d, **why)
+    found, verdict = check(home, search=False), assess(simulate(home))
+    assert {what} - {""} == foreseen(found) & {"obstacle", "landing"}
+    assert (what == "obstacle") == ("clearance" in failed(verdict))
+    assert (what == "landing") == ("touch_down" in failed(verdict))
+    assert not any("in 'fly 2'" in r.text and r.topic == "waypoint" for r in found.remarks)
+    assert not any(c.phase == "fly 2" and c.check.startswith("waypoint") for c in verdict.checks)
+
+
+def test_what_follows_a_phase_that_may_not_settle_is_not_sure():
+    """It waits for its end, which is here an abort: the phases after it are never flown."""
+    wait = {"kind": "hold", "settle": {"tolerance": 0.01, "timeout": 60.0}}
+    waits = mission(TAKE, wait, FLY, disturbances={"mass_error": 0.03}, abort={"at": 40.0})
+    assert "fly 3" not in [p.name for p in simulate(waits).phases]
+    fails = [r.text for r in check(waits, search=False).remarks if r.level == "fails"]
+    assert fails  # by what comes before
+    assert not any("in 'fly 3'" in text or "in 'hold 2'" in text for text in fails)
+
+
+@pytest.mark.parametrize(
+    "d", [{"wind": [3.0, 1, 0], "drag": 0.1}, {"mass_error": [0.05, 0.0, 0.0, 0.02]}]
+)
+def test_the_drift_of_a_phase_without_feedback_is_told(d):
+    """Wind and errors of mass carry it as far as is flown, to a tenth."""
+    adrift = mission(TAKE | {"control": "open"}, FLY, smoothness="lqr", disturbances=d)
+    found, flown = check(adrift, search=False), simulate(adrift)
+    end = flown.position[np.searchsorted(flown.time, 6.0)] - found.planned_phases[0].position[-1]
+    (text,) = (r.text for r in found.remarks if r.text.startswith("nothing holds 'establish 1'"))
+    told = float(text.split("about ")[1].split(" m")[0])
+    assert told == pytest.approx(np.linalg.norm(end.mean(axis=0)), rel=0.1)
+    calm = mission(TAKE | {"control": "open"}, FLY, smoothness="lqr")
+    assert not any(r.text.startswith("nothing holds") for r in check(calm, search=False).remarks)
+
+
+def disturbed(seed):
+    """A drawn mission that lands, with errors of mass or wind, losses and aborts."""
+    rng, draw = np.random.default_rng([seed, 7]), Draw(seed)
+    draw.land()
+    data = draw.mission(lossless=rng.random() < 0.5).to_dict()
+    d = data.setdefault("disturbances", {})
+    d["mass_error"] = (rng.choice([0.002, 0.008, 0.08]) * rng.uniform(-1, 1, 4)).round(4).tolist()
+    if rng.random() < 0.3:
+        d["wind"] = [*rng.uniform(-1.5, 1.5, 2).round(2).tolist(), round(rng.uniform(-0.3, 0.3), 2)]
+    if not ("lost" in d or draw.body or draw.open) and rng.random() < 0.5:
+        data["abort"] = {"at": round(rng.uniform(2, 60), 2)}
+    return Mission.from_dict(data)
+
+
+@pytest.mark.parametrize(
+    "seeds", [range(700, 712), pytest.param(range(800, 1000), marks=pytest.mark.long)]
+)
+def test_drawn_missions_fail_where_a_check_says_so_and_say_where_they_land(seeds):
+    """No check fails a flight that passes; vehicles in the ground, or none on it, are foreseen, at least by a note."""
+    landed = 0
+    for seed in seeds:
+        try:
+            drawn = disturbed(seed)
+            found, verdict = check(drawn, search=False), assess(simulate(drawn))
+        except MissionError:
+            continue
+        assert found.passed or not verdict.passed, seed
+        if any(p.control == "open" for p in drawn.phases):
+            continue
+        topics = {r.topic for r in found.remarks}
+        for topic, name in (("obstacle", "clearance"), ("landing", "touch_down")):
+            assert topic in topics or name not in failed(verdict), (seed, name)
+            landed += name in failed(verdict)
+    assert landed > len(seeds) / 8
 
 
 THROUGH = {"through": [{"position": [20.0, 3, 4]}]}

@@ -11,3 +11,5 @@ UNITS = {"position": "m", "velocity": "m/s", "attitude": "deg", "rates": "deg/s"
 SHAPE_TOLERANCE = 0.01
 #: Share of a limit, or of a unit, by which rounding may exceed it.
 LEEWAY = 1e-9
+#: A vehicle that stays within this distance of an obstacle below it from the start, or until the end, stands on it [m].
+PAD = 0.1

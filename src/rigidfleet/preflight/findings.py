@@ -64,8 +64,8 @@ class Remark:
     ----------
     level : "fails" or "note"
     topic : files, formation, gains, margins, network, collision, avoidance, downwash, assignment, thrust, disturbances,
-        obstacle, fence, people, geofence, speed, acceleration, waypoint, attitude, tracking error, settle or paths (not
-        checked, or estimated)
+        obstacle, fence, people, geofence, speed, acceleration, waypoint, attitude, tracking error, settle, landing,
+        loss or paths (not checked, or estimated)
     text : the problem or note in words
     """
 

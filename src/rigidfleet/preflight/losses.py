@@ -22,6 +22,7 @@ from rigidfleet.planning.preview import (
 from rigidfleet.planning.reference import copy_with
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
 from rigidfleet.preflight.obstacles import area_remarks, obstacle_remarks
+from rigidfleet.preflight.offsets import steady_offset_remarks
 from rigidfleet.preflight.trajectory import downwash_remarks, limit_remarks, separation_remarks
 from rigidfleet.rigidity import analyse
 
@@ -85,7 +86,9 @@ def loss_remarks(
     aborts = Aborts(mission, legs, mission.lost_at <= first)
     # Where the loss comes after a phase that ends by settling, where it falls is an estimate.
     settles = any(x.phase.settle is not None for x in legs if x.start < first)
-    yield from _wreck_remarks(aborts, phases, exact=not settles)
+    offset = steady_offset_remarks(mission, preflight, phases)
+    for remark in (*_wreck_remarks(aborts, phases), *offset):
+        yield replace(remark, level="note") if settles else remark
 
 
 def _path_remarks(
@@ -99,7 +102,7 @@ def _path_remarks(
         yield from judge(mission, part)
 
 
-def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase], *, exact: bool) -> Iterator[Remark]:
+def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
     """Remarks on those left who hit a lost vehicle that falls or lies, at samples of the way after the loss."""
     left, radius = aborts.left, aborts.radius[aborts.left] - aborts.fall_uncertainty.max()
     for planned in way if aborts.wrecks else ():
@@ -108,9 +111,8 @@ def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase], *, exact: bool) 
         k, i = np.unravel_index(int(room.argmin()), room.shape)
         if room[k, i] < 0.0:
             wreck = aborts.wrecks[int(near[k, i])].name
-            hits = "hits" if exact else "may hit"
-            text = f"agent {left[i] + 1} {hits} '{wreck}' at {time[k]:.2f} s in '{planned.phase}'"
-            yield Remark("fails" if exact else "note", "loss", text)
+            text = f"agent {left[i] + 1} hits '{wreck}' at {time[k]:.2f} s in '{planned.phase}'"
+            yield Remark("fails", "loss", text)
 
 
 def planned_answer_to_loss(mission: Mission, at: Leg, legs: Sequence[Leg]) -> Answer:

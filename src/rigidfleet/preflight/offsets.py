@@ -7,13 +7,13 @@ constraint law. Gusts and noise are left out: they have no mean.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
+from rigidfleet._common.waypoints import PAD, UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.math.margins import constraint_filter_matrix
@@ -38,6 +38,8 @@ _LEAST = 1e-4
 _SHAPES = 16
 #: Share of the damping with which motions count as held: by its integral, the law holds in the end what it holds a bit.
 _SMALL = 0.05
+#: What a phase promises for its arrival and its end; one that is abandoned promises nothing.
+_AT_END = ("waypoint", "attitude", "formation", "settle", "landing")
 
 
 def sampled_tracking_offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
@@ -107,36 +109,65 @@ def _offsets_of_both_laws(
     return free
 
 
-def steady_offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
+def steady_offset_remarks(
+    mission: Mission, preflight: Preflight, answer: Sequence[PlannedPhase] = ()
+) -> Iterator[Remark]:
     """Remarks on limits that steady offsets break: the flight will fail if nine tenths of an offset do.
 
     Where all of it does, a note. Limits that the plan itself breaks are told elsewhere. Gusts of two standard
-    deviations may make up for an offset.
+    deviations may make up for an offset. With the phases of the ``answer`` to a loss or an abort, on these alone.
     """
     remarks: dict[tuple[str, bool], Remark] = {}
     gusts = 0.0 if preflight.disturbed is None else preflight.disturbed.gusts
     gusts *= 2.0 / 3.0 / (mission.tracking_gains[0] * float(mission.fleet.mass.min()))
-    way, remedy = preflight.flown_phases, ""
+    before = [x for x in preflight.flown_phases if x.leg.start < mission.abandons_at]
+    way, remedy, sure = [*before, *answer], "", True
+    end = max((x.leg.end for x in (*preflight.planned_phases, *answer)), default=0.0)
     if not mission.tracking.integral:
         remedy = f"; tracking has no integral: raise the first weight in tracking.Q (now {mission.tracking.Q[0]:g})"
         remedy += ", or set tracking.integral" if mission.vehicle_models is not None else ""
-    for phase, every in zip(way, sampled_tracking_offsets(mission, way), strict=True):
+    judged = answer or before
+    offsets = sampled_tracking_offsets(mission, way)[-len(judged) :]
+    for phase, every in zip(judged, offsets, strict=True):
+        drift = _drift(mission, phase) if phase.leg.phase.control == "open" else 0.0
+        if drift > WAYPOINT_TOLERANCE["position"]:
+            text = f"nothing holds '{phase.phase}' against steady disturbances, which carry it about {drift:.2g} m off"
+            text += " its planned paths, as control = 'open': what follows begins there, and its start is not foreseen"
+            yield Remark("note", "disturbances", text)
         planned, whole = _planned_for_those_left(mission, phase)
         off = np.where(planned.leg.before.lost[:, None], 0.0, every)
         far = float(np.linalg.norm(off, axis=2).max())
         if far < _LEAST:
             continue
-        broken = partial(_broken_limits_in_words, mission, preflight, planned)
+        last = planned.leg.end == end
+        broken = partial(_broken_limits_in_words, mission, preflight, planned, last)
         if not (now := broken(off)):
             continue
         own, surely = broken(0.0 * off), broken(max(0.0, _SURE - gusts / far) * off)
-        for topic in (topic for topic in now if topic not in own):
+        abandoned = planned.leg.start < mission.abandons_at < planned.leg.t_end
+        for topic in now:
+            if topic in own or (abandoned and topic in _AT_END):
+                continue
             evaded = is_left_to_avoidance(mission, topic, mission.limits.separation or 0.0)
-            fails = planned.exact and whole and topic in surely and not evaded
+            # Near the ground, rotors give more thrust than is known here.
+            evaded |= planned.leg.phase.lands and mission.all_disturbances.ground_effect
+            fails = sure and planned.exact and whole and topic in surely and not evaded
             text = f"steady disturbances push vehicles up to {far:.2g} m off their slots in '{planned.phase}'"
             remark = Remark("fails" if fails else "note", topic, f"{text}: {now[topic]}{remedy}")
             remarks.setdefault((topic, fails), remark)
+        # One that does not settle ends the flight, or waits for what abandons it.
+        sure = sure and "settle" not in now
     yield from remarks.values()
+
+
+def _drift(mission: Mission, planned: PlannedPhase) -> float:
+    """How far [m] steady forces have carried the centre of mass off its way at the end of a phase without feedback."""
+    masses, step = mission.fleet.mass, float(planned.time[1] - planned.time[0])
+    x, v = np.zeros((2, 3))
+    for push in masses @ _unmodelled_accelerations(mission, planned) / masses.sum():
+        v += step * (push - mission.drag.sum() / masses.sum() * v)
+        x += step * v
+    return float(np.linalg.norm(x))
 
 
 def _planned_for_those_left(mission: Mission, planned: PlannedPhase) -> tuple[PlannedPhase, bool]:
@@ -150,18 +181,16 @@ def _planned_for_those_left(mission: Mission, planned: PlannedPhase) -> tuple[Pl
 
 
 def _broken_limits_in_words(
-    mission: Mission, preflight: Preflight, planned: PlannedPhase, offsets: Floats
+    mission: Mission, preflight: Preflight, planned: PlannedPhase, last: bool, offsets: Floats
 ) -> dict[str, str]:
-    """Topic and words of the limits that a planned phase breaks with offsets (K, N, 3) [m]."""
+    """Topic and words of the limits that a planned phase, perhaps the last, breaks with offsets (K, N, 3) [m]."""
     leg, phase, limits = planned.leg, planned.leg.phase, mission.limits
     left, r, far = ~leg.before.lost, planned.position + offsets, np.linalg.norm(offsets, axis=2)
     masses = np.where(left, mission.fleet.mass, 0.0)
     moved = replace(planned, position=r, path_ends=None)
     there = Preflight(mission, preflight.formations, preflight.gains, [moved], [moved])
     remarks = [*separation_remarks(mission, there), *downwash_remarks(mission, there)]
-    remarks += measured_remarks(mission, moved)
-    if not phase.lands:  # that ends where vehicles stand
-        remarks += obstacle_remarks(mission, there)
+    remarks += [*measured_remarks(mission, moved), *obstacle_remarks(mission, there)]
     broken = {remark.topic: remark.text for remark in remarks if remark.level == "fails"}
     proved, least = leg.certificate, there.separation
     if proved is not None and least is not None:
@@ -190,7 +219,6 @@ def _broken_limits_in_words(
         turn = rigid_body.kabsch(r[k], planned.position[k], masses, near=np.eye(3))
         by = float(np.degrees(np.linalg.norm(att.rotation_vector_from_dcm(turn))))
         held.append(("attitude", "", by, WAYPOINT_TOLERANCE["attitude"]))
-    last = leg.end == preflight.flown_phases[-1].leg.end
     name = leg.planned_end_state.formation
     if name and (phase.shaping is not None or last) and left.sum() > 1 and len(left) <= STACKED:
         # To first order: a turn of the whole changes no distance.
@@ -202,6 +230,10 @@ def _broken_limits_in_words(
         held.append(("formation", "", by, mission.formations[name].greatest_error(length.min())))
     if phase.settle is not None and not mission.tracking.integral:  # which settles later
         held.append(("settle", "", float(far[-1].max()), phase.settle.tolerance))
+    if phase.lands:
+        high, _ = proximity.obstacle_clearances(r[-1], leg.radius, mission.obstacles, leg.end)
+        by = float(high[left].min())
+        held.append(("landing", "the lowest vehicle above the ground", by, PAD))
     for topic, what, by, most in held:
         if most is not None and by > most:
             unit = UNITS.get(topic, "m")

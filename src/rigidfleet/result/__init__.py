@@ -5,8 +5,9 @@ netCDF-4 file, in which each variable has its unit and its meaning. The file als
 flight can be repeated from its result. NaN means "not active".
 """
 
+from rigidfleet._common.waypoints import PAD
 from rigidfleet.result.netcdf import LABELS, Variable
-from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
+from rigidfleet.result.phases import Extremum, PhaseRecord
 from rigidfleet.result.result import (
     CLOSE,
     LATER,

@@ -48,10 +48,6 @@ class Planned(_Moment):
     how: str
 
 
-#: A vehicle that stays within this distance of an obstacle below it from the start, or until the end, stands on it [m].
-PAD = 0.1
-
-
 class Extremum(NamedTuple):
     """Worst value of a quantity in continuous time, not only at samples.
 

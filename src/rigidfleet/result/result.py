@@ -20,9 +20,10 @@ from rigidfleet._common.facts import Fact, FactTable, Row, Sheet, Shown, table_o
 from rigidfleet._common.files import write_file
 from rigidfleet._common.quantities import PLACES, quantity
 from rigidfleet._common.renamed import with_earlier_members
+from rigidfleet._common.waypoints import PAD
 from rigidfleet.errors import MissionError, ResultError, wrong_type
 from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, netcdf_content, read_netcdf
-from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
+from rigidfleet.result.phases import Extremum, PhaseRecord
 from rigidfleet.setpoints import Setpoints, csv_text, setpoints_at_rate, states_with_jerk
 from rigidfleet.typing import Bools, Floats, Ints
 
