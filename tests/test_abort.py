@@ -571,6 +571,10 @@ def test_what_stands_in_the_way_is_named() -> None:
     abort = aborts_of(mission).abort_at(2.0)
     assert not abort.home.way
     assert "'roof' stands in the way" in abort.home.reason
+    often = check_aborts(Mission.from_dict(mission.to_dict() | {"abort": {"step": 15.0}}))
+    *_, none = often.sentences()
+    last = often.aborts[-1].ordered
+    assert none.startswith(f"From 0 to {last:g} s, none: to any place: 'roof' stands in the way of")
     result = rf.simulate(Mission.from_dict(mission.to_dict() | {"abort": {"at": 2.0}}))
     assert not result.complete
     assert "'roof' stands in the way" in result.ending

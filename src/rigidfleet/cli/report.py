@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 from contextlib import nullcontext
 from hashlib import sha256
@@ -188,38 +187,13 @@ def _abort_sentences(folder: Path, mission: Mission) -> list[str]:
     path = folder / "aborts.json"
     try:
         data = json.loads(path.read_bytes())
-        digest, every = data["mission_sha256"], data["aborts"]
+        digest, sentences = data["mission_sha256"], [*map(str, data["sentences"])]
     except (OSError, ValueError, LookupError, TypeError):
         raise ResultError(
             f"{path}: is no file of aborts of this version. `rigidfleet check --abort --out {folder}` writes it."
         ) from None
     _refuse_other_mission(path, digest, mission)
-    ways = [x for x in every if x["way"]]
-    to = {"any": "to any places where vehicles stood", "own": "each to its own place"}[data["to"]]
-    lines = [
-        f"Within {data['reaction_s']:g} s of an order, all slow down along the plan, then go home, {to}."
-    ]
-    text = (
-        f"A way home is proved from {len(ways)} of {len(every)} times, {data['step_s']:g} s apart"
-    )
-    if ways:
-        text += f"; it takes {max(x['ends_s'] - x['ordered_s'] for x in ways):.1f} s at most"
-    if near := [x["separation"]["least_m"] for x in ways if x["separation"]]:
-        text += f", and no two vehicles come nearer than {min(near):.2f} m"
-    lines.append(f"{text}.")
-    for way, group in itertools.groupby(every, lambda x: bool(x["way"])):
-        run = [*group]
-        if not way:
-            first, last = run[0]["ordered_s"], run[-1]["ordered_s"]
-            lines.append(f"None from {first:g} to {last:g} s: {run[0]['reason']}.")
-    if unheard := [x["unheard"] for x in ways if x["unheard"]]:
-        worst = min(unheard, key=lambda x: x["least_m"])
-        i, j = worst["agents"]
-        near = f"comes within {worst['least_m']:.2f} m of" if worst["least_m"] > 0.0 else "hits"
-        lines.append(
-            f"If one does not hear: agent {i} flies on and {near} agent {j} at {worst['time_s']:.1f} s."
-        )
-    return [*lines, _name_and_digest_text(path)]
+    return [*sentences, _name_and_digest_text(path)]
 
 
 def _refuse_other_mission(path: Path, digest: str, mission: Mission) -> None:

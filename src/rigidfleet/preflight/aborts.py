@@ -41,20 +41,42 @@ class AbortsCheck(Shown):
         """The least separation that all ways home promise [m]."""
         return min((x.certificate.separation for x in self.aborts if x.home.way), default=np.inf)
 
+    @property
+    def _proved(self) -> str:
+        """From how many times a way home is proved, and how near vehicles come on it, in words."""
+        ways = sum(bool(x.home.way) for x in self.aborts)
+        step, least = self.mission.aborting.step, self.least_separation
+        text = f"a way home is proved from {ways} of {len(self.aborts)} times, {step:g} s apart"
+        near = f"; no two vehicles come nearer than {least:.2f} m" if np.isfinite(least) else ""
+        return text + near
+
     def facts(self) -> Sheet:
         """Runs of orders with the same answer, each with its worst numbers."""
-        options, name, all_ = self.mission.aborting, self.mission.name, len(self.aborts)
+        options, name = self.mission.aborting, self.mission.name
         heads = ("ordered [s]", "way home", "takes [s]", "least [m]", "one that does not hear")
-        ways = sum(bool(x.home.way) for x in self.aborts)
-        text = f"{name}: a way home from {ways} of {all_} times, {options.step:g} s apart"
-        if np.isfinite(self.least_separation):
-            text += f"; no two vehicles come nearer than {self.least_separation:.2f} m"
         to = "any place" if options.to == "any" else "their own places"
+        level = "ok" if self.aborts and all(x.home.way for x in self.aborts) else "note"
         parts = [
             FactTable(heads, [*self._rows_by_answer()], ("way home", "one that does not hear")),
-            Line(text, "ok" if 0 < ways == all_ else "note"),
+            Line(f"{name}: {self._proved}", level),
         ]
         return Sheet(name, f"aborts, {options.reaction:g} s after each order, to {to}", parts)
+
+    def sentences(self) -> list[str]:
+        """How the mission is aborted, from when and when not, and what follows if a vehicle does not hear the order."""
+        options, rows = self.mission.aborting, [*self._rows_by_answer()]
+        to = "to any places where vehicles stood" if options.to == "any" else "each to its own place"
+        lines = [
+            f"Within {options.reaction:g} s of an order, all slow down along the plan, then go home, {to}."
+        ]
+        ways = [(x, y) for x, y in zip(self.aborts, self.unheard, strict=True) if x.home.way]
+        takes = max((x.rest_time - x.ordered for x, _ in ways), default=0.0)
+        longest = f"; going home takes {takes:.1f} s at most" if ways else ""
+        lines.append(f"{self._proved[0].upper()}{self._proved[1:]}{longest}.")
+        lines += [f"From {row.cells[0]} s, {row.cells[1]}." for row in rows if row.level]
+        if worst := self._unheard_in_words(min((y for _, y in ways if y), key=min, default=[])):
+            lines.append(f"If one does not hear: {worst}.")
+        return lines
 
     def _rows_by_answer(self) -> Iterator[Row]:
         both = zip(self.aborts, self.unheard, strict=True)
@@ -79,8 +101,8 @@ class AbortsCheck(Shown):
         if not each:
             return ""
         least, when, i, j = min(each)
-        near = f"least {least:.2f} m," if least > 0.0 else "hits"
-        text = f"{agent_names([i])} flies on: {near} {agent_names([j])} at {when:.1f} s"
+        near = f"comes within {least:.2f} m of" if least > 0.0 else "hits"
+        text = f"{agent_names([i])} flies on and {near} {agent_names([j])} at {when:.1f} s"
         count = self._endangered_vehicles(each)
         return text + (f"; {count} would come too near" if count else "")
 
@@ -94,6 +116,7 @@ class AbortsCheck(Shown):
         return {
             "mission_sha256": self.mission.digest,
             "to": options.to, "reaction_s": options.reaction, "step_s": options.step,
+            "sentences": self.sentences(),
             "aborts": [
                 {
                     "ordered_s": x.ordered, "begins_s": x.begins, "waits_s": x.waits,
