@@ -358,7 +358,8 @@ def test_the_first_page_says_what_drill_and_aborts_have_shown(calm, tmp_path, ca
     assert f"proved from {len(ways)} of {len(data['aborts'])} times, 1 s apart" in text
     assert f"come nearer than {min(x['separation']['least_m'] for x in ways):.2f} m;" in text
     assert f"; going home takes {max(x['ends_s'] - x['ordered_s'] for x in ways):.1f} s at most." in text
-    assert data["sentences"] and all(sentence in text for sentence in data["sentences"])
+    assert data["sentences"]
+    assert all(sentence in text for sentence in data["sentences"])
     for file in (drill / "sweep.db", home / "aborts.json"):
         assert f"{file.name}, SHA-256 {hashlib.sha256(file.read_bytes()).hexdigest()}" in text
     mission.write_text(calm.mission_text.replace("speed = 9.0", "speed = 9.5"))
