@@ -357,7 +357,10 @@ def test_the_first_page_says_what_drill_and_aborts_have_shown(calm, tmp_path, ca
     ways = [x for x in data["aborts"] if x["way"]]
     assert f"proved from {len(ways)} of {len(data['aborts'])} times, 1 s apart" in text
     assert f"come nearer than {min(x['separation']['least_m'] for x in ways):.2f} m;" in text
-    assert f"; going home takes {max(x['ends_s'] - x['ordered_s'] for x in ways):.1f} s at most." in text
+    assert (
+        f"; going home takes {max(x['ends_s'] - x['ordered_s'] for x in ways):.1f} s at most."
+        in text
+    )
     assert data["sentences"]
     assert all(sentence in text for sentence in data["sentences"])
     for file in (drill / "sweep.db", home / "aborts.json"):

@@ -65,7 +65,9 @@ class AbortsCheck(Shown):
     def sentences(self) -> list[str]:
         """How the mission is aborted, from when and when not, and what follows if a vehicle does not hear the order."""
         options, rows = self.mission.aborting, [*self._rows_by_answer()]
-        to = "to any places where vehicles stood" if options.to == "any" else "each to its own place"
+        to = (
+            "to any places where vehicles stood" if options.to == "any" else "each to its own place"
+        )
         lines = [
             f"Within {options.reaction:g} s of an order, all slow down along the plan, then go home, {to}."
         ]
