@@ -121,7 +121,7 @@ def test_intervals_of_positions_hold(kind: str, count: int) -> None:
     for _ in range(count):
         curve = noisy(kind, random).curves[0]
         log = Positions(curve.time, curve.at(curve.time)[:, :3], np.ones(len(curve.time)))
-        likely = smooth(log, PositionNoise(SIGMA, tau), knots_over(log.time, 0.0, 0.025))
+        likely = smooth(log, PositionNoise(SIGMA, tau), knots_over(log.time, 0.025))
         ways = b_spline_curve(likely.knots, likely.draw(40, random)).at(t)
         drawn = np.std(ways, axis=2)
         held.append(np.abs(likely.way.at(t) - places(t)[:, 0]) < 1.96 * drawn)

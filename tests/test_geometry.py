@@ -522,6 +522,11 @@ def test_headroom_is_the_least_height_above_another(n: int):
             if np.hypot(*(r[k, i] - r[k, j])[:2]) <= radius[i] + radius[j]
         ]
         assert (distance[k], *pair[k]) == pytest.approx(min(found))
-    distance, pair = proximity.headroom(np.array([[[0.0, 0, 0], [9, 0, 0]]]), [0.1, 0.1])
-    assert np.isinf(distance[0])
-    assert pair.tolist() == [[-1, -1]]
+    far = np.full((1, n, 3), np.nan)
+    for far[0, :2] in (
+        [[0.0, 0, 0], [9, 0, 0]],
+        np.nan,
+    ):  # apart from each other, and nobody is there
+        distance, pair = proximity.headroom(far, np.full(n, 0.1))
+        assert np.isinf(distance[0])
+        assert pair.tolist() == [[-1, -1]]

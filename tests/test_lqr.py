@@ -71,6 +71,18 @@ def test_infinite_horizon_against_python_control(seed):
     assert pytest.approx(P_control, rel=1e-9, abs=1e-10) == P
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_infinite_horizon_of_rates_far_apart(seed):
+    """Where rates of the closed loop differ by 1e6 and one input moves six states, the cost is still SciPy's."""
+    rng = np.random.default_rng(seed)
+    system, C = (rng.normal(size=(6, 6)), rng.normal(size=(6, 1))), rng.normal(size=(6, 6))
+    weights = 1e5 * C @ C.T, np.array([[1e-5]])
+    K, P = infinite_horizon(*system, *weights)
+    expected = solve_continuous_are(*system, *weights)
+    assert pytest.approx(expected, rel=0, abs=2e-9 * np.abs(expected).max()) == P
+    assert np.linalg.eigvals(system[0] - system[1] @ K).real.max() < 0
+
+
 @settings(max_examples=30)
 @given(weight, st.floats(0.0, 1e4), weight, st.floats(-0.9, 0.9))
 def test_double_integrator_gains(q1, q2, r, coupling):

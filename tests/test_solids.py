@@ -188,6 +188,19 @@ def test_the_kernel_compiles_the_same_distances():
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", FORMS)
+def test_points_together_are_as_far_as_each_alone(name):
+    """Arrays of any shape, and single numbers, give the same distances and normals."""
+    solid = records.one_solid(FORMS[name])
+    here = distance.local_point(*WHERE, 0, solid)
+    for measure in (distance.signed_distance, distance.outward_normal):
+        line = np.array(measure(*here, 0, solid))
+        grid = measure(*(x.reshape(20, 15) for x in here), 0, solid)
+        each = [measure(*x, 0, solid) for x in np.transpose(here).tolist()]
+        np.testing.assert_allclose(np.reshape(grid, line.shape), line, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(np.transpose(each), line, rtol=0, atol=1e-14)
+
+
 def test_a_solid_is_where_its_waypoints_say():
     """Straight between waypoints, at rest before the first and after the last."""
     times, ways = np.array([1.0, 2.0, 5.0]), RNG.normal(size=(3, 3))

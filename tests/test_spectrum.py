@@ -28,6 +28,17 @@ def test_spectrum_is_that_of_the_dense_analysis(edges):
     assert found.condition == pytest.approx(found.w_max / found.w)
 
 
+@pytest.mark.parametrize(("n", "space"), [(2, 3), (2, 2), (3, 2), (3, 3)])
+def test_spectrum_of_few_agents(n, space):
+    """Two and three agents, too, have both ends: without their rigid motions, few eigenvalues are left."""
+    p = np.random.default_rng(n).normal(size=(n, space))
+    edges = graphs.complete_graph(n)
+    found = spectrum(p, edges, np.ones(n))
+    values = np.linalg.svd(jacobian(p, edges), compute_uv=False) ** 2
+    assert (found.w, found.w_max) == pytest.approx((values.min(), values.max()), rel=1e-6)
+    assert found.free == 0
+
+
 def test_flexible_formations_are_found():
     """A cubic lattice with edges along its axes alone shears in three ways, and in more at its sides."""
     side = np.arange(5.0)

@@ -123,7 +123,7 @@ def euler_from_dcm(T: ArrayLike) -> Floats:
     T = _check_last_axes("T", T, 3, 3)
     cos_pitch = np.hypot(T[..., 0, 0], T[..., 0, 1])
     pitch = np.arctan2(-T[..., 0, 2], cos_pitch)
-    locked = cos_pitch < 1e-12
+    locked = cos_pitch < 1e-14
     yaw = np.where(
         locked, np.arctan2(-T[..., 1, 0], T[..., 1, 1]), np.arctan2(T[..., 0, 1], T[..., 0, 0])
     )

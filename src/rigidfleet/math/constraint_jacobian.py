@@ -18,20 +18,15 @@ def jacobian(points: ArrayLike, edges: ArrayLike) -> Floats:
     """
     p = np.asarray(points, dtype=np.float64)
     i, j = np.asarray(edges, dtype=np.int64).reshape(-1, 2).T
-    u, row = _unit_vectors(p, i, j), np.arange(len(i))
+    u, row = p.take(i, axis=-2) - p.take(j, axis=-2), np.arange(len(i))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = u / np.sqrt(np.add.reduce(u * u, axis=-1, keepdims=True))
     # Agents of an edge first, samples last, so that an assignment is one pass.
     J = np.zeros((len(i), p.shape[-2], *p.shape[:-2], p.shape[-1]))
     J[row, i] = np.moveaxis(u, -2, 0)
     J[row, j] = -J[row, i]
     J = np.moveaxis(J, (0, 1), (-3, -2))
     return J.reshape(*p.shape[:-2], len(i), p.shape[-2] * p.shape[-1])
-
-
-def _unit_vectors(p: Floats, i: Ints, j: Ints) -> Floats:
-    """u_ij (..., m, d) from agents j (m,) to i (m,) at p (..., N, d), not finite where they are at the same place."""
-    u = p.take(i, axis=-2) - p.take(j, axis=-2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return u / np.sqrt(np.add.reduce(u * u, axis=-1, keepdims=True))
 
 
 def filter_factors(
@@ -80,14 +75,7 @@ def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = N
     if len(r) > some:
         parts = [r[k : k + some] for k in range(0, len(r), some)]
         return np.concatenate([smallest_singular_value(part, edges, masses) for part in parts])
-    if masses is not None or len(edges) > 3 * r.shape[1]:
-        return least_singular(jacobian(r, edges), masses)
-    if len(edges) == 3:
-        return _least_singular_of_three_edges(r, edges)
-    # J J^T without J: u_ij^T u_kl, by the agents that two edges share.
-    ends = np.transpose(edges)
-    u, incidence = _unit_vectors(r, *ends), np.subtract(*np.eye(r.shape[1])[ends])
-    return _least_nonzero_singular_value((u @ u.swapaxes(1, 2)) * (incidence @ incidence.T))
+    return least_singular(jacobian(r, edges), masses)
 
 
 def least_singular(J: Floats, masses: ArrayLike | None = None) -> Floats:
@@ -97,41 +85,10 @@ def least_singular(J: Floats, masses: ArrayLike | None = None) -> Floats:
         J = J * np.repeat(np.sqrt(m.mean() / m), 3)
     # The smaller Gram matrix takes a third of the time of a decomposition of J itself.
     turned = J.swapaxes(1, 2)
-    return _least_nonzero_singular_value(J @ turned if J.shape[1] <= J.shape[2] else turned @ J)
-
-
-def _least_singular_of_three_edges(r: Floats, edges: Ints) -> Floats:
-    """`smallest_singular_value` (K,) of three edges, in a seventh of the time.
-
-    With the cosines c of the angles between edges that share an agent, 0 of others, J J^T is 2 + S, where S has no
-    diagonal. Its eigenvalues are the roots of x^3 - p x - 2 c_1 c_2 c_3, p = c_1^2 + c_2^2 + c_3^2, by Viete's formula.
-    """
-    (i, j), after = np.transpose(edges), [1, 2, 0]
-    x = np.ascontiguousarray(r.T)  # rows of samples are faster
-    u = x.take(i, axis=1) - x.take(j, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u /= np.sqrt(np.add.reduce(u * u))
-    incidence = np.subtract(*np.eye(r.shape[1])[[i, j]])
-    c = np.add.reduce(u * u[:, after]) * (incidence * incidence[after]).sum(axis=1)[:, None]
-    square = c * c
-    p, apart = np.add.reduce(square), square - square[after]
-    # p^3 - 27 (c_1 c_2 c_3)^2 as a sum of squares, which is exact where two eigenvalues are nearly equal.
-    spread = np.add.reduce((0.5 * p + 3.0 * square[[2, 0, 1]]) * apart * apart)
-    angle = np.arctan2(np.sqrt(spread), np.sqrt(27.0) * c[0] * c[1] * c[2]) / 3.0
-    turns = 2.0 * np.pi / 3.0 * np.array([[1.0], [2.0], [0.0]])
-    return _root_of_least_nonzero((2.0 + 2.0 * np.sqrt(p / 3.0) * np.cos(angle + turns)).T)
-
-
-def _least_nonzero_singular_value(gram: Floats) -> Floats:
-    """Roots (K,) of the smallest non-zero eigenvalues of matrices (K, s, s), NaN of those that are not finite."""
+    gram = J @ turned if J.shape[1] <= J.shape[2] else turned @ J
     known = np.isfinite(gram).all(axis=(1, 2))
     gram[~known] = 0.0
     w = np.asarray(np.linalg.eigvalsh(gram), dtype=float)
     w[~known] = np.nan
-    return _root_of_least_nonzero(w)
-
-
-def _root_of_least_nonzero(w: Floats) -> Floats:
-    """Roots (K,) of the smallest of eigenvalues (K, s), in ascending order, that are not zero."""
     w[w < 1e-14 * w[:, -1:]] = np.inf
     return np.sqrt(w.min(axis=1))

@@ -355,20 +355,15 @@ def _is_stable(loop: Loop, law: LoopGains, growth_limit: float) -> bool:
     # The poles of L at 0 are left of this line. To its right L is analytic and vanishes at infinity.
     omega = np.append(0.0, np.geomspace(0.1 * growth_limit, end, _SAMPLES))
     F = return_difference(omega)
-    turn = np.linalg.solve(F[:-1], F[1:])
     for _ in range(30):
+        turn = np.linalg.solve(F[:-1], F[1:])
         turns = np.linalg.norm(turn - np.eye(n), axis=(-2, -1))
         far = np.flatnonzero(turns > near)
         if not len(far):
             break
         middle = 0.5 * (omega[far] + omega[far + 1])
-        between = return_difference(middle)
-        # Only the halves of an interval that is divided are new.
-        halves = np.linalg.solve(F[far], between), np.linalg.solve(between, F[far + 1])
-        turn[far] = halves[0]
-        turn = np.insert(turn, far + 1, halves[1], axis=0)
         omega = np.insert(omega, far + 1, middle)
-        F = np.insert(F, far + 1, between, axis=0)
+        F = np.insert(F, far + 1, return_difference(middle), axis=0)
     else:
         return False  # det(1 + L) = 0 on the line itself
     turned = np.angle(np.linalg.slogdet(turn)[0]).sum()

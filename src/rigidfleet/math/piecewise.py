@@ -65,7 +65,7 @@ class Piecewise(NamedTuple):
     def taylor_coefficients(self, t: Floats, orders: int) -> Floats:
         """Taylor coefficients (orders, T, ...) at times (T,) [s]."""
         k = piece_index(self.time, t)
-        return series.polynomial_series(_take_pieces(self.pieces, k), t - self.time[k], orders)
+        return series.polynomial_series(self.pieces[k], t - self.time[k], orders)
 
     def at(self, t: Floats) -> Floats:
         """Values (T, ...) at times (T,) [s]."""
@@ -84,7 +84,7 @@ class Piecewise(NamedTuple):
     def at_shares(self, shares: Floats) -> Floats:
         """Values (K, S, ...) of each piece at shares (S,) of its time."""
         after = np.diff(self.time)[:, None] * shares
-        each = _take_pieces(self.pieces, np.repeat(np.arange(len(after)), len(shares)))
+        each = np.repeat(self.pieces, len(shares), axis=0)
         values = series.polynomial_series(each, after.ravel(), 1)[0]
         return values.reshape(*after.shape, *values.shape[1:])
 
@@ -112,14 +112,14 @@ class Piecewise(NamedTuple):
         middle = 0.5 * (knots[:-1] + knots[1:])
         begin = np.clip(knots[:-1], self.time[0], self.time[-1]) if stays else knots[:-1]
         k = piece_index(self.time, middle)
-        pieces = expand_about(_take_pieces(self.pieces, k), begin - self.time[k])
+        pieces = expand_about(self.pieces[k], begin - self.time[k])
         if stays:
             pieces[(middle < self.time[0]) | (middle > self.time[-1]), ..., 1:] = 0.0
         return Piecewise(knots, pieces)
 
-    def insert_knots(self, times: Floats, apart: float = 0.0) -> Piecewise:
-        """The same with further knots at times that lie inside, further ``apart`` [s] from any of its own."""
-        return self.with_knots(refine_knots(self.time, times, apart))
+    def insert_knots(self, times: Floats) -> Piecewise:
+        """The same with further knots at times that lie inside."""
+        return self.with_knots(refine_knots(self.time, times))
 
     def slice_pieces(self, first: int, last: int) -> Piecewise:
         """The pieces from a first one to before a last one."""
@@ -235,14 +235,6 @@ def pad(pieces: Floats, powers: int) -> Floats:
     if lacking <= 0:
         return pieces.copy(order="K")
     return np.pad(pieces, [(0, 0)] * (pieces.ndim - 1) + [(0, lacking)])
-
-
-def _take_pieces(pieces: Floats, k: Ints) -> Floats:
-    """Pieces (k, ..., P); of many, each coefficient is a row in memory, as `series.polynomial_series` takes them."""
-    if len(k) < len(pieces):
-        return pieces[k]
-    turned = -1, *range(1, pieces.ndim - 1), 0
-    return pieces.transpose(turned).take(k, axis=-1).transpose(turned)
 
 
 def expand_about(pieces: Floats, x: Floats) -> Floats:

@@ -25,9 +25,6 @@ _SAMPLE = 256
 
 # Number of values that fit into the processor's cache.
 CACHED = 60_000
-#: Number of points for which a surface of triangles is searched at once, those of each sample together: near ones need
-#: the same triangles.
-_TOGETHER = 2048
 #: Kinds of solids whose distance takes a search of triangles.
 _SURFACES = HULL, HEIGHTS
 
@@ -156,8 +153,6 @@ def _least_vertical_gap(r: Floats, radius: Floats) -> tuple[float, Ints]:
     from scipy.spatial import KDTree
 
     who = np.flatnonzero(np.isfinite(r).all(axis=1))
-    if not len(who):
-        return np.inf, np.array([-1, -1])
     near = who[KDTree(r[who, :2]).query_pairs(2.0 * radius.max(), output_type="ndarray")]
     apart, radii = r[near[:, 0]] - r[near[:, 1]], radius[near].sum(axis=1)
     overlap = apart[:, 0] ** 2 + apart[:, 1] ** 2 <= radii**2
@@ -216,8 +211,7 @@ def closeness(
 ) -> Closeness:
     """Distances of the agents ``left`` (K, N) at r (K, N, 3), with radius (N,), to each other and to obstacles."""
     each, nearest = obstacle_clearances(r, radius, obstacles, time)
-    if not left.all():
-        each[~left] = np.inf
+    each[~left] = np.inf
     return Closeness(
         *separation_of_remaining(r, radius, left), each, nearest, *least_clearance(each, nearest)
     )
@@ -242,7 +236,15 @@ def obstacle_clearances(
     some = max(1, CACHED * n // max(1, r.size))
     for first in range(0, n if obstacles else 0, some):
         part = slice(first, first + some)
-        _update_nearest(least[part], nearest[part], r[..., part, :], radius[part], obstacles, time)
+        # Axis by axis, in rows of samples, which is faster.
+        places = np.ascontiguousarray(r[..., part, :].T)
+        own, near, which = radius[part].reshape(-1, *[1] * (r.ndim - 2)), least[part], nearest[part]
+        for k, thing in enumerate(obstacles):
+            far = near + own if thing.solid.kind[0] in _SURFACES else np.inf
+            clearance = distances(*places, thing.solid, time, far)
+            clearance -= own
+            np.putmask(which, clearance < near, k)
+            np.fmin(near, clearance, out=near)  # NaN is no distance
     return least.T, nearest.T
 
 
@@ -255,31 +257,9 @@ def below(
     """
     under = np.zeros((len(obstacles), len(r)), dtype=np.bool_)
     for b, thing in enumerate(obstacles):
-        near = np.flatnonzero(distances(*r.T, thing.solid, time) <= radius + reach)
-        for first in range(0, len(near), _TOGETHER):
-            some = near[first : first + _TOGETHER]
-            under[b, some] = distance.is_solid_below(*r[some].T, 0, thing.solid)
+        near = distances(*r.T, thing.solid, time) <= radius + reach
+        under[b, near] = distance.is_solid_below(*r[near].T, 0, thing.solid)
     return under
-
-
-def _update_nearest(
-    least: Floats,
-    nearest: Ints,
-    r: Floats,
-    radius: Floats,
-    obstacles: Sequence[Obstacle],
-    time: ArrayLike,
-) -> None:
-    """Reduce distances (N, ...) of agents r (..., N, 3) to those of nearer obstacles."""
-    # Axis by axis, in rows of samples, which is faster.
-    places = np.ascontiguousarray(r.T)
-    radius = radius.reshape(-1, *[1] * (r.ndim - 2))
-    for k, thing in enumerate(obstacles):
-        far = least + radius if thing.solid.kind[0] in _SURFACES else np.inf
-        clearance = distances(*places, thing.solid, time, far)
-        clearance -= radius
-        np.putmask(nearest, clearance < least, k)
-        np.fmin(least, clearance, out=least)  # NaN is no distance
 
 
 def distances(
@@ -294,13 +274,9 @@ def distances(
         x, y, z = x - shift[0], y - shift[1], z - shift[2]
     x, y, z = distance.local_point(x, y, z, 0, solid)
     if solid.kind[0] in _SURFACES:
-        away = np.full(x.shape[::-1], np.inf)
-        near = np.flatnonzero((distance.box_distance(x, y, z, solid.size[0]) < most).T)
-        points, flat = np.stack([x.T, y.T, z.T]).reshape(3, -1), away.reshape(-1)
-        for first in range(0, len(near), _TOGETHER):
-            some = near[first : first + _TOGETHER]
-            flat[some] = distance.signed_distance(*points[:, some], 0, solid)
-        away = away.T
+        away = np.full(x.shape, np.inf)
+        near = distance.box_distance(x, y, z, solid.size[0]) < most
+        away[near] = distance.signed_distance(x[near], y[near], z[near], 0, solid)
     else:
         away = distance.signed_distance(x, y, z, 0, solid)
     if not any(map(math.isfinite, solid.there[0].tolist())):

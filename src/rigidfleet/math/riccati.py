@@ -68,7 +68,7 @@ def _needs_small_steps(A: Floats, G: Floats, Q: Floats, S: Floats, T: float) -> 
         return False
     if not (is_semidefinite(Q) and is_semidefinite(S)):
         return False
-    rate = _fastest_rate(A, G, Q)
+    rate = fastest_rate(A, G, Q)
     stages = np.ldexp(T, -np.arange(math.ceil(math.log2(2.0 * rate * T)) + 1))
     try:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -84,7 +84,7 @@ def _march_cost(A: Floats, G: Floats, Q: Floats, S: Floats, to_go: Floats) -> tu
     Columns of x are the states that each state alone, at the greatest time to go, leads to. Raises ValueError if there
     are too many steps.
     """
-    identity, rate = np.eye(len(A)), _fastest_rate(A, G, Q)
+    identity, rate = np.eye(len(A)), fastest_rate(A, G, Q)
     P, costs, moves = S, [], []
     steps = 0
     every, which = np.unique(to_go, return_inverse=True)
@@ -124,7 +124,7 @@ def _hamiltonian_flow(
     Raises ValueError if P, starting from S, does not exist at all times to go up to T.
     """
     if is_semidefinite(Q) and is_semidefinite(S):
-        return np.zeros_like(Q), *_transition_and_gramians(A, G, Q, tau, _fastest_rate(A, G, Q))[:3]
+        return np.zeros_like(Q), *_transition_and_gramians(A, G, Q, tau, fastest_rate(A, G, Q))[:3]
     # P - S starts from zero. Its Phi, W and V therefore exist exactly as long as P does.
     GS = G @ S
     A, Q = A - GS, A.T @ S + S @ A - S @ GS + Q
@@ -172,13 +172,13 @@ def solution_by_subspace(H: Floats) -> Floats:
     return 0.5 * (P + P.T)
 
 
-def _fastest_rate(A: Floats, G: Floats, Q: Floats) -> float:
+def fastest_rate(A: Floats, G: Floats, Q: Floats) -> float:
     """Rate of the fastest motion of a Hamiltonian system [1/s]."""
     return float(np.abs(np.linalg.eigvals(hamiltonian(A, G, Q))).max())
 
 
 def _transition_and_gramians(
-    A: Floats, G: Floats, Q: Floats, tau: Floats, fastest_rate: float
+    A: Floats, G: Floats, Q: Floats, tau: Floats, rate: float
 ) -> tuple[Floats, Floats, Floats, Bools]:
     """Phi, W, V (..., n, n): x(tau) = Phi x(0) - W y(tau), y(0) = V x(0) + Phi^T y(tau).
 
@@ -193,7 +193,7 @@ def _transition_and_gramians(
     identity = np.eye(n)
     backward = -hamiltonian(A, G, Q)
     with np.errstate(divide="ignore"):
-        doublings = np.ceil(np.log2(2.0 * fastest_rate * tau)).clip(min=0.0)
+        doublings = np.ceil(np.log2(2.0 * rate * tau)).clip(min=0.0)
     # A Taylor series, because each entry keeps its own leading power of the step. A Pade approximant
     # would round the small entries (W begins with the third power) relative to the large ones.
     step = backward * (tau * 0.5**doublings)[..., None, None]

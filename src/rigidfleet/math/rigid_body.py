@@ -77,8 +77,6 @@ def best_rotation(
     """
     rotation = u @ vt
     proper = np.linalg.det(rotation) > 0
-    if s.ndim == 1 and proper and s[1] > tol * s[0]:  # the usual case, of one fit
-        return rotation, proper
     turned = u
     if not proper.all():
         turned = u * np.where(proper[..., None], 1.0, _MIRROR)[..., None, :]

@@ -103,10 +103,10 @@ def b_spline_curve(knots: Floats, points: Floats) -> Piecewise:
     return Piecewise(knots, windows @ QUARTIC / h ** np.arange(5.0))
 
 
-def knots_over(time: Floats, zero: float, step: float) -> Floats:
-    """Even knots at multiples of a step after a zero [s] that cover times (K,), and a step before and after them."""
-    first, last = np.floor((time[0] - zero) / step), np.ceil((time[-1] - zero) / step)
-    return zero + step * np.arange(first - 1.0, max(last, first + 1.0) + 2.0)
+def knots_over(time: Floats, step: float) -> Floats:
+    """Even knots at multiples of a step [s] that cover times (K,), and a step before and after them."""
+    first, last = np.floor(time[0] / step), np.ceil(time[-1] / step)
+    return step * np.arange(first - 1.0, max(last, first + 1.0) + 2.0)
 
 
 def _whiten(samples: Positions, noise: PositionNoise, knots: Floats) -> tuple[Any, Floats, float]:
@@ -234,7 +234,7 @@ def fit_noise(vehicles: Sequence[Positions], sigma: float | None, step: float) -
         some.append(Positions(*(x[first : first + _ENOUGH] for x in own)))
     steps = [float(np.median(np.diff(own.time))) for own in some]
     both = zip(some, steps, strict=True)
-    knots = [knots_over(own.time, 0.0, max(step, each)) for own, each in both]
+    knots = [knots_over(own.time, max(step, each)) for own, each in both]
     usual = float(np.median(steps))
     size = np.nan if sigma is None else sigma
     calm = [smooth(own, PositionNoise(size), k).calm for own, k in zip(some, knots, strict=True)]

@@ -25,9 +25,6 @@ _STILL = 1e-5
 #: Relative difference below which two lengths or strengths are the same: rounding must not choose between them.
 _ALIKE = 1e-6
 
-#: Share of the original squares below which the remainder has too few correct digits.
-_SPENT = 1e-8
-
 
 class Flex(NamedTuple):
     """A motion that changes no distance of an edge to first order, up to a rigid motion of all agents."""
@@ -94,35 +91,12 @@ class Framework:
         """Edges that could all be removed at once without loss of rank, long ones first."""
         if self.stress_dimension == 0:
             return np.zeros(0, dtype=np.int64)
+        from scipy.linalg import qr
+
         # Pivoting takes the largest remainder, so weights make short edges come first. The pivots still span the
         # range, since each is independent of those before.
-        weight = self.lengths.min() / self.lengths
-        kept = _independent_rows(weight[:, None] * self.span)
-        return np.setdiff1d(np.arange(len(self.edges)), kept)
-
-
-def _independent_rows(rows: Floats) -> Ints:
-    """Indices (k,) of k independent rows of ``rows`` (., k), which has full rank; large rows first.
-
-    QR with column pivoting: each is the row with the largest part outside the span of those before.
-    """
-    k = rows.shape[1]
-    rest, Q, kept = (rows**2).sum(axis=1), np.zeros((k, k)), np.zeros(k, dtype=np.int64)
-    trusted = rest.max(initial=0.0)
-    for n in range(k):
-        if rest.max() < _SPENT * trusted:  # only rounding is left of the squares: recompute them
-            beyond = rows - rows @ Q[:n].T @ Q[:n]
-            rest = (beyond**2).sum(axis=1)
-            rest[kept[:n]] = 0.0
-            trusted = rest.max()
-        kept[n] = rest.argmax()
-        q = rows[kept[n]]
-        for _ in range(2):
-            q = q - q @ Q[:n].T @ Q[:n]
-        Q[n] = q / np.linalg.norm(q)
-        rest -= (rows @ Q[n]) ** 2
-        rest[kept[: n + 1]] = 0.0
-    return kept
+        pivots = qr(self.span.T * (self.lengths.min() / self.lengths), mode="r", pivoting=True)[1]
+        return np.sort(pivots[self.rank :])
 
 
 def localised_flexes(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:

@@ -77,9 +77,10 @@ def spectrum(points: ArrayLike, edges: Ints, masses: ArrayLike) -> Spectrum:
         return y - rigid @ (rigid.T @ y)
 
     operator = LinearOperator(K.shape, matvec=apply_inverse, dtype=np.float64)  # ty: ignore
+    few = min(_LOWEST, d * n - rigid.shape[1])
     try:
         held = eigsh(
-            K, k=_LOWEST, sigma=shift, OPinv=operator, v0=apply_inverse(start), return_eigenvectors=False, tol=1e-9,
+            K, k=few, sigma=shift, OPinv=operator, v0=apply_inverse(start), return_eigenvectors=False, tol=1e-9,
             maxiter=_MOST_RESTARTS,
         )  # fmt: skip
     except ArpackNoConvergence:  # many eigenvalues close to zero cannot be separated

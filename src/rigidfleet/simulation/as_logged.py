@@ -207,8 +207,7 @@ def _smooth_ways(logs: Sequence[Positions], noise: PositionNoise) -> list[Smooth
     steps = usual.min() * 2.0 ** np.floor(np.log2(usual / usual.min()))
     both = zip(logs, steps.tolist(), strict=True)
     return [
-        smoothing.smooth(log, noise, smoothing.knots_over(log.time, 0.0, step))
-        for log, step in both
+        smoothing.smooth(log, noise, smoothing.knots_over(log.time, step)) for log, step in both
     ]
 
 

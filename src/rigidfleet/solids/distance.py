@@ -2,7 +2,7 @@
 
 Every function takes coordinates x, y, z that are numbers, or arrays of one shape. NumPy runs it on arrays. The kernel
 compiles the same source for numbers (`rigidfleet.kernel.compiler.elementwise`), so there is one distance in plan,
-flight and verdict. What differs between numbers and arrays is in `where`, `any_true` and `floor`.
+flight and verdict. What differs between numbers and arrays is in the first functions, up to `floor`.
 
 Points are in the solid's own axes, unless a docstring says otherwise.
 """
@@ -28,6 +28,18 @@ def where(test: Numbers, this: Numbers, other: Numbers) -> Numbers:
 def any_true(test: Numbers) -> Any:
     """Whether the test holds for any point."""
     return np.any(test)
+
+
+def pick(test: Numbers, values: Any) -> Any:
+    """The values of those points alone for which the test holds; of one point, its own."""
+    return tuple(np.asarray(value)[test] for value in values)
+
+
+def put(test: Numbers, values: Any, picked: Any) -> Any:
+    """The values with those of `pick` in their places."""
+    whole = np.array(values)
+    whole[:, test] = picked
+    return tuple(whole)
 
 
 def floor(x: Numbers) -> Any:
@@ -165,13 +177,17 @@ def vector_from_solid_surface(x: Numbers, y: Numbers, z: Numbers, b: int, solids
     node = first[0]
     while node < last[0]:
         far = np.maximum(box_distance(x, y, z, solids.nodes[node]), 0.0)
-        if not any_true(far * far < best):
+        near = far * far < best
+        if not any_true(near):
             node = solids.after[node]
             continue
-        for m in range(solids.leaf[node, 0], solids.leaf[node, 1]):
-            u, v, w, d = triangle_vector_and_square(x, y, z, solids.triangles[m])
-            nearer = d < best
-            i, j, k, best = choose_four(nearer, (u, v, w, d), (i, j, k, best))
+        if solids.leaf[node, 1] > 0:
+            p, q, r = pick(near, (x, y, z))
+            nearest = pick(near, (i, j, k, best))
+            for m in range(solids.leaf[node, 0], solids.leaf[node, 1]):
+                this = triangle_vector_and_square(p, q, r, solids.triangles[m])
+                nearest = choose_four(this[3] < nearest[3], this, nearest)
+            i, j, k, best = put(near, (i, j, k, best), nearest)
         node += 1
     return i, j, k, best
 
@@ -214,10 +230,7 @@ def signed_distance(x: Numbers, y: Numbers, z: Numbers, b: int, solids: Any) -> 
     """Signed distance [m] from solid b of some; negative inside."""
     kind = solids.kind[b]
     if kind == ROUNDED:
-        near = box_distance(x, y, z, solids.size[b])
-        if solids.rounding[b] > 0.0:
-            near = near - solids.rounding[b]
-        return near
+        return box_distance(x, y, z, solids.size[b]) - solids.rounding[b]
     if kind == CYLINDER:
         return cylinder_distance(x, y, z, solids.size[b])
     _, _, _, squared = vector_from_solid_surface(x, y, z, b, solids)

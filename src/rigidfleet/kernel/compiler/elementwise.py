@@ -26,6 +26,10 @@ overload(distance.where, jit_options=OPTIONS)(
     lambda test, this, other: lambda test, this, other: this if test else other
 )
 overload(distance.any_true, jit_options=OPTIONS)(lambda test: lambda test: test)
+overload(distance.pick, jit_options=OPTIONS)(lambda test, values: lambda test, values: values)
+overload(distance.put, jit_options=OPTIONS)(
+    lambda test, values, picked: lambda test, values, picked: picked
+)
 overload(distance.floor, jit_options=OPTIONS)(lambda x: _floor)
 
 for _function in distance.ELEMENTWISE:
