@@ -91,12 +91,17 @@ class Framework:
         """Edges that could all be removed at once without loss of rank, long ones first."""
         if self.stress_dimension == 0:
             return np.zeros(0, dtype=np.int64)
-        from scipy.linalg import qr
-
-        # Pivoting takes the largest remainder, so weights make short edges come first. The pivots still span the
-        # range, since each is independent of those before.
-        pivots = qr(self.span.T * (self.lengths.min() / self.lengths), mode="r", pivoting=True)[1]
-        return np.sort(pivots[self.rank :])
+        # Pivoted Cholesky of the rows' Gram matrix, without SciPy, which a check would wait for: the row with the largest
+        # remainder comes next. Weights make short edges come first, and the chosen rows still span the range.
+        rows, kept = self.span * (self.lengths.min() / self.lengths)[:, None], list[int]()
+        L, rest = np.zeros_like(rows), (rows * rows).sum(axis=1)
+        for n in range(self.rank):
+            kept.append(int(rest.argmax()))
+            L[:, n] = rows @ rows[kept[n]] - L[:, :n] @ L[kept[n], :n]
+            L[:, n] /= np.sqrt(rest[kept[n]])
+            rest -= L[:, n] ** 2
+            rest[kept] = 0.0
+        return np.setdiff1d(np.arange(len(rest)), kept)
 
 
 def localised_flexes(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
