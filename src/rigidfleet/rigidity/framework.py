@@ -91,8 +91,8 @@ class Framework:
         """Edges that could all be removed at once without loss of rank, long ones first."""
         if self.stress_dimension == 0:
             return np.zeros(0, dtype=np.int64)
-        # Pivoted Cholesky of the rows' Gram matrix, without SciPy, which a check would wait for: the row with the largest
-        # remainder comes next. Weights make short edges come first, and the chosen rows still span the range.
+        # Pivoted Cholesky of the rows' Gram matrix, without SciPy, for which a check would wait: the row with the
+        # largest remainder comes next. Weights make short edges come first, and the chosen rows still span the range.
         rows, kept = self.span * (self.lengths.min() / self.lengths)[:, None], list[int]()
         L, rest = np.zeros_like(rows), (rows * rows).sum(axis=1)
         for n in range(self.rank):
