@@ -468,20 +468,10 @@ class Mission(Contents, Shown):
         own = self.constraint.damping
         if own != "auto":
             return own
-        slots = self.formation_slots(name) if name else None
-        if name is None or slots is None:
+        if name is None or self.formation_slots(name) is None:
             return _DAMPING[1]
-        edges = self.formation_edges(name)
-        masses = self.fleet.mass
-        if lost is not None and lost.any():
-            left = ~lost
-            edges = (np.cumsum(left) - 1)[edges[left[edges].all(axis=1)]]
-            slots, masses = slots[left], masses[left]
-        if not len(edges) or min(len(edges), 3 * len(masses)) > _DENSE:
-            return _DAMPING[1]
-        J = constraint_jacobian.jacobian(slots[None], edges)
-        (singular,) = constraint_jacobian.least_singular(J, masses)  # of mbar J M^-1 J^T
-        return float(np.clip(singular**2 / 4, *_DAMPING))
+        gone = () if lost is None else np.flatnonzero(lost).tolist()
+        return part_of_mission(self, _automatic_damping, name, *gone)
 
     @property
     def latest_end(self) -> float:
@@ -648,3 +638,17 @@ class Mission(Contents, Shown):
     def on_loss(self) -> Literal["continue", "hold", "land", "abort"]:
         """What the others do when a vehicle or link is lost."""
         return self.all_disturbances.on_loss
+
+
+def _automatic_damping(mission: Mission, name: str, *lost: int) -> float:
+    """`Mission.damping` "auto" at a formation with slots, without the vehicles that are lost."""
+    left = ~np.isin(np.arange(mission.n_agents), lost)
+    edges, masses = mission.formation_edges(name), mission.fleet.mass[left]
+    slots = mission.formation_slots(name)
+    assert slots is not None
+    edges = (np.cumsum(left) - 1)[edges[left[edges].all(axis=1)]]
+    if not len(edges) or min(len(edges), 3 * len(masses)) > _DENSE:
+        return _DAMPING[1]
+    J = constraint_jacobian.jacobian(slots[None, left], edges)
+    (singular,) = constraint_jacobian.least_singular(J, masses)  # of mbar J M^-1 J^T
+    return float(np.clip(singular**2 / 4, *_DAMPING))

@@ -290,6 +290,8 @@ def _limit_integrator_step(external: External, motion: Motion, reference: Refere
     """
     most = longest = 2.0 * external.max_step
     for knots, pieces in ((motion.knots, motion.coefficients), (reference.knots, reference.ways)):
+        if len(knots) < 3:
+            continue  # a single piece follows nothing
         span = np.diff(knots)[:, None] ** np.arange(2, pieces.shape[-1])
         steady = np.einsum("k...p,kp->...k", np.abs(pieces[..., 2:]), span) < _ROUNDED
         for *c, k in np.argwhere(steady[..., :-1] & ~steady[..., 1:]):
