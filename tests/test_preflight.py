@@ -740,3 +740,13 @@ def test_a_flat_formation_does_not_become_spatial_by_its_edges():
     flown = mission(LEVEL, formations=forms, phases=phases)
     assert check(flown).passed
     assert assess(simulate(flown)).passed
+
+
+def test_an_obstacle_that_is_not_there_in_flight_is_nothing():
+    """One that appears after the flight, beside one that is there, has no least clearance, and fails nothing."""
+    data = load_mission("square").to_dict()
+    late = {"name": "late", "kind": "sphere", "centre": [50, 0, 9], "radius": 1.0}
+    here = late | {"name": "here", "centre": [60, 0, 9]}
+    data["obstacles"] = [*data.get("obstacles", []), late | {"appears": 5e3, "vanishes": 6e3}, here]
+    ahead = check(Mission.from_dict(data))
+    assert [name for name, *_ in ahead.clearance if name in ("late", "here")] == ["here"]

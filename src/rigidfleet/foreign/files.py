@@ -62,6 +62,8 @@ SUFFIXES = (".csv", ".skyc", *_RECORDINGS, *_LOGS)
 #: A time between two samples that is noted, and one that is refused, in usual steps (medians) of the vehicle; repeated
 #: positions that are noted.
 _NOTED, _LONGEST, _REPEATED = 1.5, 10.0, 5
+#: How many times as far as any other place one is that stands for no position.
+_BEYOND = 5.0
 #: Share of a number that is rounding, and the greatest number of things that a note lists.
 _ROUNDING, _LISTED = 1e-6, 5
 
@@ -430,14 +432,16 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
         sizes = np.append(moves[moving], np.inf)
         fast = sizes > 0.5 * np.median(sizes)
         odd = (fast[:-2] & fast[1:-1]) | (sizes[1:-1] > 1.5 * sizes[2:])
-        # One number for x, y and z, such as 9999, stands for no position; 0 may be the origin.
+        # One number for x, y and z, such as 9999, stands for no position if nothing else is nearly as far; 0, -1 and
+        # corners of a square may be places.
         place = np.abs(curve.pieces[:, :3, 0])
         number = np.where((place == place[:, :1]).all(axis=1), place[:, 0], np.nan)
         leaps = moves > _LONGEST * np.median(sizes)
-        if len(both := np.intersect1d(number[1:][leaps], number[:-1][leaps])) and both[-1] > 0.0:
+        both = np.intersect1d(number[1:][leaps], number[:-1][leaps])
+        if len(both) and both[-1] > _BEYOND * place[number != both[-1]].max(initial=0.1):
             why = f"{name!r} leaps to a place of which each coordinate is {both[-1]:g} m in size, and back"
             raise _error(source, f"{why}, as if it had none there", "Leave out such rows")
-        leaps &= (number[:-1] == 0.0) | (number[1:] == 0.0)
+        leaps &= np.isin(number[:-1], [0.0, *both]) | np.isin(number[1:], [0.0, *both])
         frozen += [f"{name!r} at {curve.time[k + 1]:g} s" for k in np.flatnonzero(leaps)[:1]]
         for k in np.flatnonzero((np.diff(moving) > _REPEATED) & odd).tolist():
             start, stop = curve.time[[moving[k] + 1, moving[k + 1]]]
@@ -461,7 +465,8 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
     if len(holes) > _LISTED:
         notes.append(f"{len(holes) - _LISTED:,} shorter gaps between samples are bridged, too")
     if frozen:
-        words = f"positions repeat to the last digit between moves, or leap from or to 0, {first_few(frozen)}"
+        words = "positions repeat to the last digit between moves, or leap from or to 0 or one number for x, y and z"
+        words += f", {first_few(frozen)}"
         notes.append(f"{words}: a hold, or a tracker that lost sight of it")
     return notes
 

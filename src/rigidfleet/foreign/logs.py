@@ -231,12 +231,13 @@ def trajectories_of(
     notes = {note: [""] for note in log.notes}
     several |= len(log.vehicles) > 1
     for who in sorted(log.vehicles, key=natural_sort_key):
-        reasons: list[str] = []
+        reasons, read = list[str](), list[tuple[Channel, _Track]]()
         channels = choose_channels(log.vehicles[who], topics)
         unlike = lambda c: several and FORMS[c.message][0].frame == "ned" and c.reference is None  # noqa: E731
         for channel in sorted(channels, key=unlike):
             try:
                 track = _track_of(channel, origin)
+                read += [(channel, track)] * (len(track.time) > 1)
                 if topics or len(track.time) * _USABLE >= len(channel.columns["time"]):
                     break
                 reasons.append(
@@ -245,7 +246,9 @@ def trajectories_of(
             except ContentError as error:
                 reasons.append(str(error).rstrip("."))
         else:
-            raise fault("; ".join(reasons[:_LISTED]), "Name a topic that has valid positions")
+            if not read:
+                raise fault("; ".join(reasons[:_LISTED]), "Name a topic that has valid positions")
+            channel, track = read[0]
         words = f"positions are those of {channel.topic}"
         if others := [c.topic for c in channels if c is not channel and not topics][:_LISTED]:
             words += f"; --topic may name {', '.join(others)}"

@@ -42,7 +42,7 @@ class AbortsCheck(Shown):
         return min((x.certificate.separation for x in self.aborts if x.home.way), default=np.inf)
 
     @property
-    def _proved(self) -> str:
+    def _proved_in_words(self) -> str:
         """From how many times a way home is proved, and how near vehicles come on it, in words."""
         ways = sum(bool(x.home.way) for x in self.aborts)
         step, least = self.mission.aborting.step, self.least_separation
@@ -58,7 +58,7 @@ class AbortsCheck(Shown):
         level = "ok" if self.aborts and all(x.home.way for x in self.aborts) else "note"
         parts = [
             FactTable(heads, [*self._rows_by_answer()], ("way home", "one that does not hear")),
-            Line(f"{name}: {self._proved}", level),
+            Line(f"{name}: {self._proved_in_words}", level),
         ]
         return Sheet(name, f"aborts, {options.reaction:g} s after each order, to {to}", parts)
 
@@ -74,8 +74,9 @@ class AbortsCheck(Shown):
         ways = [(x, y) for x, y in zip(self.aborts, self.unheard, strict=True) if x.home.way]
         takes = max((x.rest_time - x.ordered for x, _ in ways), default=0.0)
         longest = f"; going home takes {takes:.1f} s at most" if ways else ""
-        lines.append(f"{self._proved[0].upper()}{self._proved[1:]}{longest}.")
-        lines += [f"From {row.cells[0]} s, {row.cells[1]}." for row in rows if row.level]
+        lines.append(f"{self._proved_in_words[0].upper()}{self._proved_in_words[1:]}{longest}.")
+        none = ((row.cells[0], row.cells[1]) for row in rows if row.level)
+        lines += [f"{'From' if ' to ' in when else 'At'} {when} s, {why}." for when, why in none]
         if worst := self._unheard_in_words(min((y for _, y in ways if y), key=min, default=[])):
             lines.append(f"If one does not hear: {worst}.")
         return lines

@@ -67,7 +67,8 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
         if compared > _COMPARED:
             skipped = near[rank:][far[:, near[rank:]].min(axis=0) <= 0].tolist()
             break
-        shown[b] = worst
+        if worst:  # it is there during the flight
+            shown[b] = worst
     for b in sorted(shown):
         thing, (clearance, t, i, _) = mission.obstacles[b], min(shown[b].values())
         preflight.clearance.append((thing.name, clearance, t, f"agent {i + 1}"))

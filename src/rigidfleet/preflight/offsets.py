@@ -122,7 +122,7 @@ def steady_offset_remarks(
     gusts *= 2.0 / 3.0 / (mission.tracking_gains[0] * float(mission.fleet.mass.min()))
     before = [x for x in preflight.flown_phases if x.leg.start < mission.abandons_at]
     way, remedy, sure = [*before, *answer], "", True
-    end = max((x.leg.end for x in (*preflight.planned_phases, *answer)), default=0.0)
+    end = [x.leg.end for x in answer or preflight.planned_phases][-1:]
     if not mission.tracking.integral:
         remedy = f"; tracking has no integral: raise the first weight in tracking.Q (now {mission.tracking.Q[0]:g})"
         remedy += ", or set tracking.integral" if mission.vehicle_models is not None else ""
@@ -134,12 +134,13 @@ def steady_offset_remarks(
             text = f"nothing holds '{phase.phase}' against steady disturbances, which carry it about {drift:.2g} m off"
             text += " its planned paths, as control = 'open': what follows begins there, and its start is not foreseen"
             yield Remark("note", "disturbances", text)
+            sure = False
         planned, whole = _planned_for_those_left(mission, phase)
         off = np.where(planned.leg.before.lost[:, None], 0.0, every)
         far = float(np.linalg.norm(off, axis=2).max())
         if far < _LEAST:
             continue
-        last = planned.leg.end == end
+        last = planned.leg.end in end
         broken = partial(_broken_limits_in_words, mission, preflight, planned, last)
         if not (now := broken(off)):
             continue
