@@ -80,9 +80,8 @@ def infinite_horizon(
         raise ValueError(_WIDE)
     # Beyond 40 of the slowest time constants, the cost to go no longer depends on its final value.
     P = riccati.cost_to_go(F, G, W, start, np.array(40.0 / slowest))
-    for _ in range(
-        _NEWTON
-    ):  # Rounding of B R^-1 B^T may have taken digits: Newton's steps do without it (Kleinman)
+    # Rounding of B R^-1 B^T may have taken digits: Newton's steps do without it (Kleinman).
+    for _ in range(_NEWTON):
         K = riccati.solve_linear(R, B.T @ P + N.T)
         rest = A.T @ P + P @ A - K.T @ R @ K + Q
         step = solve_continuous_lyapunov((A - B @ K).T, -rest)

@@ -55,9 +55,8 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             compared += planned.position[:, :, 0].size + _EACH
             if compared > _COMPARED:
                 break
-            each = np.where(
-                planned.leg.before.lost, -bounds.LENGTH.most, radius
-            )  # the lost are not near
+            # The lost are not near.
+            each = np.where(planned.leg.before.lost, -bounds.LENGTH.most, radius)
             clearance, agent, time, proved = clearance_to(planned, thing, each, paces[k])
             if clearance - proved > max(unproved.get(b, 0.0), 1.5 * CLEARANCE_ACCURACY):
                 unproved[b] = clearance - proved

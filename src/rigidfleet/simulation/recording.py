@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rigidfleet.kernel.mail import Links, Mail
     from rigidfleet.kernel.problem import Motion, Problem, Reference, Workspace
     from rigidfleet.mission import Mission
-from rigidfleet.mission.schema import VehicleYaw
+    from rigidfleet.mission.schema import VehicleYaw
 
 #: Greatest number of edges, or of coordinates, for which the smallest singular value of J is recorded.
 _SINGULAR = 400

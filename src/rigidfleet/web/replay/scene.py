@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from rigidfleet.mission.fences import Area
     from rigidfleet.result import PhaseRecord, Result
 
-EDGES = 3000  # greatest number of edges drawn; more would hide the vehicles
+#: Greatest number of edges drawn; more would hide the vehicles.
+EDGES = 3000
 _LINES = 12  # greatest number of lines in a plot; for more agents, the least and the greatest value
 #: Greatest number of obstacles that an overview fits one by one; more are fitted together.
 _BOXES = 200
