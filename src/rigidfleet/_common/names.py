@@ -107,7 +107,7 @@ def unit_of(text: str) -> tuple[Dimension, float] | None:
 
 @cache
 def meaning_of(name: str) -> ColumnMeaning:
-    """The quantity, unit and vehicle of a column's name."""
+    """The quantity, unit and vehicle of a column's name; kept, as a file's names are asked for several times."""
     if own := CRAZYFLIE.fullmatch(name):
         unit = "deg" if own[3] == "yaw" else ("mm" if own[1] else "m") + "/s" * bool(own[2])
         return ColumnMeaning(own[2] + own[3], unit)

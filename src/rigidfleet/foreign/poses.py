@@ -229,7 +229,7 @@ def _records_of_mcap(path: Path) -> Iterator[tuple[str, str, str, str, bytes, in
 
 @lru_cache(100)
 def _message_layout(definition: str, little: bool) -> np.dtype[Any]:
-    """Where the fields of a message are after its first 4 bytes, if all have one size."""
+    """Where the fields of a message are after its first 4 bytes, if all have one size: kept for the next ones."""
     fields, at = dict[str, tuple[np.dtype[Any], int]](), 0
     line = r"(?m)^[ \t]*(\w+)(?:\[(\d+)\])?[ \t]+(\w+)[ \t]*(?:#.*)?$"
     for kind, count, name in re.findall(line, definition.partition("\n===")[0]):

@@ -5,7 +5,7 @@ compiled with the extents that types of arrays declare here as numbers (see `com
 """
 
 import math
-from functools import cache, lru_cache
+from functools import cache
 from itertools import accumulate
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
@@ -288,7 +288,6 @@ def workspace(
     return w
 
 
-@lru_cache
 def _workspace_layout(*sizes: int) -> np.dtype[Any]:
     """Arrays of extents N, m, A, V and H side by side in one memory, each aligned to a cache line."""
     size_of: dict[Any, int] = dict(zip("NmAVH", sizes, strict=True))

@@ -20,7 +20,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -128,7 +127,6 @@ class LoopGains:
         return replace(self, alpha=alpha, beta=beta, gamma=gamma)
 
 
-@lru_cache
 def tracking_lag_time(lag: Lag, laws: LoopGains, drag: float) -> float:
     """Time T [s] by which a vehicle that tracks leaves its reference at most, in any direction, under either law.
 

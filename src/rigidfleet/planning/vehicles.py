@@ -7,7 +7,6 @@ bit for bit, however the flight is divided.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -487,7 +486,6 @@ def _random_rows(kind: int, seed: int, rows: range, shape: tuple[int, ...]) -> F
     return numbers[begin : begin + len(rows)]
 
 
-@lru_cache(maxsize=8)
 def _random_block(kind: int, seed: int, block: int, shape: tuple[int, ...]) -> Floats:
     random = np.random.default_rng((kind, seed, block))
     size = (_BLOCK, *shape)

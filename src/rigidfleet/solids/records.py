@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
 from itertools import product
 from typing import NamedTuple
 
@@ -187,7 +186,7 @@ def one_solid(
 def join_solids(parts: Sequence[Solids]) -> Solids:
     """All solids of several records in one."""
     if not parts:
-        return _no_solids()
+        return one_solid(half_space(0.0))._replace(kind=np.zeros(0, dtype=np.int64))
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     joint = Solids(*columns)
     counts = np.array(
@@ -202,11 +201,6 @@ def join_solids(parts: Sequence[Solids]) -> Solids:
         after=joint.after + nodes[:, 0],
         leaf=joint.leaf + nodes[:, 1:],
     )
-
-
-@cache
-def _no_solids() -> Solids:
-    return one_solid(half_space(0.0))._replace(kind=np.zeros(0, dtype=np.int64))
 
 
 def box_corners(low: ArrayLike, high: ArrayLike) -> Floats:

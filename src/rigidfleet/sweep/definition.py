@@ -388,7 +388,7 @@ def _group_or_number(column: SweepColumn, number: int) -> str | int:
 
 @lru_cache(maxsize=4)
 def sweep_of_json(text: str) -> Sweep:
-    """Restore a sweep from its JSON; cached for the next chunks."""
+    """Restore a sweep from its JSON; kept for the next chunks, which would find its ways again (1.4 s)."""
     return Sweep.from_json(text)
 
 

@@ -405,5 +405,5 @@ class Show:
 
 @lru_cache(maxsize=2)
 def show_of(text: str, drill: Drill) -> Show:
-    """The show of a mission's text: flown or read once for all faults."""
+    """The show of a mission's text: kept, so that it is flown or read once for all faults."""
     return Show(Mission.from_toml(text, "mission of the drill"), drill)
