@@ -101,21 +101,13 @@ def _names_of(flights: Sequence[Result]) -> list[str]:
 def _flight_data(result: Result, verdict: Verdict, label: str, colour: str) -> dict[str, Any]:
     """What the template of a page shows of one flight, by the template's names."""
     mission = result.mission
-    first, *rest = verdict.summary.split("\n")
-    head, _, praise = first.partition(": ")[2].partition("; ")
-    head = head.partition(".")[0]
-    failed = [line.removeprefix("- ") for line in rest if line.startswith("- ")]
     return {
         "label": label,
         "head_cell": Cell(label, colour=colour),
         "name": mission.name,
         "title": mission.title,
         "source": mission.source,
-        "passed": verdict.passed,
-        "word": verdict.word,
-        "head": head,
-        "words": failed or [praise or verdict.covers],
-        "notes": [verdict.uncalled, *verdict.notes] if verdict.uncalled else verdict.notes,
+        "verdict": verdict,
         "plan": brief.plan_sentences(result),
         "phases": mission.phase_table,
         "checks": [part for part in verdict.facts().shown_parts if isinstance(part, FactTable)],
