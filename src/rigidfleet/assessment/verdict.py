@@ -351,12 +351,9 @@ class Verdict(Shown):
         return json.dumps(self.to_dict(), ensure_ascii=False, allow_nan=False, indent=2)
 
     def __repr__(self) -> str:
-        judged = [check for check in self.checks if check.judged]
-        failed = len(self.failures)
-        if self.word == "undecided":
-            return f"<Verdict {self.mission}: undecided in {len(self.undecided_checks)} of {len(judged)} checks>"
-        ending = f"failed {failed} of {len(judged)}" if failed else f"passed all {len(judged)}"
-        return f"<Verdict {self.mission}: {ending} checks>"
+        judged = sum(check.judged for check in self.checks)
+        words = {"failed": f"failed {self.head}", "undecided": f"undecided in {self.head}"}
+        return f"<Verdict {self.mission}: {words.get(self.word, f'passed all {judged} checks')}>"
 
     def facts(self) -> Sheet:
         """The tables of phases, waypoints and checks, the notes, and the verdict in words."""

@@ -8,7 +8,6 @@ way needs no look inside, and every other is halved.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -106,13 +105,9 @@ class _Spans(NamedTuple):
 
 
 def clearance_to(
-    planned: PlannedPhase,
-    thing: Obstacle,
-    radius: Floats,
-    speed: Floats,
-    without: Bools | Sequence[int] = (),
+    planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Floats, lost: Bools | None = None
 ) -> Closest:
-    """Least clearance of a planned phase to an obstacle in continuous time, ``without`` some agents.
+    """Least clearance of a planned phase to an obstacle in continuous time, of all agents but the ``lost``.
 
     ``speed`` is the `speed_bounds` of the phase. Where the room between two samples might not do, the plan is evaluated
     in the middle, and so on.
@@ -124,7 +119,8 @@ def clearance_to(
     if not len(time):
         return Closest(np.inf, 0, float(planned.time[0]), np.inf)
     each, _ = proximity.obstacle_clearances(position, radius, [thing], time)
-    each[:, without] = np.inf
+    if lost is not None:
+        each[:, lost] = np.inf
     k, i = np.unravel_index(int(each.argmin()), each.shape)
     best, agent, when = float(each[k, i]), int(i), float(time[k])
     everybody, least, done = np.arange(each.shape[1]), np.inf, 0
