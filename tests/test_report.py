@@ -233,6 +233,16 @@ def test_legends_of_several_flights_are_whole(calm, hasty):
         assert len({row.split("(")[1].split(" ")[0] for row in rows}) == 1, rows
 
 
+def test_flights_side_by_side_have_no_empty_panel():
+    """What no flight has, as a lone trajectory has neither a separation nor a thrust, has no axes."""
+    way = np.linspace([[0.0, 0.0, 1.0]], [[3.0, 0.0, 1.0]], 4)
+    alone = trajectories(np.arange(4.0), way, cubic=True)
+    root = ET.fromstring(overlay.svg_of_time_curves([alone, alone], ["one", "other"]))
+    words = " ".join(e.text for e in root.iter() if e.text)
+    assert "greatest speed [m/s]" in words
+    assert not re.search(r"separation|thrust|clearance|constraint", words)
+
+
 def test_side_by_side(calm, hasty, quick):
     """Of several flights the page tells what differs: numbers, keys of the missions, overlaid figures."""
     page = page_contents([calm, hasty], ["calm", "hasty"], None)
