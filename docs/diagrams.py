@@ -313,8 +313,8 @@ def solvers() -> Figure:
     )
     marks = ((1.5, "triangle"), (0.259, "cube"), (0.05, "cuboid"), (8e-4, "line, 8 cm off"))
     for at, name in marks:
-        ax.axvline(at, color=FAINT, linewidth=0.9, linestyle=":")
-        ax.text(at, 1.5e4, f"{name} ", rotation=90, fontsize=8, color=GREY, va="top", ha="right")
+        ax.vlines(at, 0.5, 2e4, color=FAINT, linewidth=0.9, linestyle=":")
+        ax.text(at, 1.5e4, f" {name}", fontsize=8, color=GREY, va="top")
     ax.set(
         xlabel=r"eigenvalue $w$ of $\bar m A$", ylabel=r"gain $\varphi(w)/\bar m$", ylim=(0.08, 2e4)
     )

@@ -28,6 +28,8 @@ from rigidfleet.mission import mission_names
 from rigidfleet.preflight.check import check
 from rigidfleet.reporting import report_page
 from rigidfleet.reporting.contents import page_contents
+from rigidfleet.sweep.metrics import readable_unit
+from rigidfleet.sweep.record import reason_in_words
 from rigidfleet.sweep.summary import summarise
 from rigidfleet.tuning.outcome import Flown, Tuned
 
@@ -360,9 +362,30 @@ def numbers_wanted(data: Any, show: bool) -> dict[tuple[str, str], list[float]]:
     return wanted
 
 
+def test_a_summary_of_a_sweep_shows_what_its_json_holds():
+    """Percentiles with units, reasons of failure, strong correlations and the rate of success are those of JSON."""
+    summary = summarise(everything())
+    data, parts = json.loads(summary.json()), summary.facts().shown_parts
+    tables = {x.heads[0]: x for x in parts if isinstance(x, FactTable)}
+    assert tables["metric"].cell_texts == [
+        [name, readable_unit(data["units"][name]), *map(value, by_percent.values())]
+        for name, by_percent in data["percentiles"].items()
+    ]
+    assert [row[:2] for row in tables["failed check"].cell_texts] == [
+        [reason_in_words(reason), f"{count}"] for reason, count in data["reasons"].items()
+    ]
+    sure = [d for d in data["drivers"] if d["adjusted"] < data["false_discovery_rate"]]
+    wanted = [[d["varied"], d["outcome"], f"{d['correlation']:+.2f}"] for d in sure]
+    assert tables["varied number"].cell_texts == wanted
+    passed, last = data["success"], parts[-1]
+    assert isinstance(last, Line)
+    assert last.text.startswith(f"{passed['count']} of {passed['of']} runs passed")
+    assert last.level == "note"
+
+
 @pytest.mark.usefixtures("quick")
 def test_the_page_has_the_tables_of_its_objects(flights):
-    """The report of a flight has the phases of its mission and the tables of its verdict, row by row."""
+    """The report of a flight has the phases of its mission and its verdict's tables, row by row, with their words."""
     page = report_page(flights[0])
     tables = re.findall(r"<table.*?</table>", page, flags=re.DOTALL)
     rows = [row for table in tables for row in rows_of(table)]
@@ -370,6 +393,10 @@ def test_the_page_has_the_tables_of_its_objects(flights):
         for part in sheet.shown_parts:
             if isinstance(part, FactTable):
                 assert all(row in rows for row in rows_of(part.html()))
+    words = [x for x in sheet.shown_parts if isinstance(x, Line) and not x.level]
+    assert words
+    assert all(x.html() in page for x in words)
+    assert page.count('<div class="table"><table') == len(tables), "each scrolls by itself"
 
 
 SHOWS = ["show", "show-1000", "market-square"]

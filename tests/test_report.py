@@ -23,6 +23,7 @@ from rigidfleet.reporting import gains, overlay, report, report_page
 from rigidfleet.reporting.contents import page_contents
 from rigidfleet.result import Result
 from rigidfleet.simulation.flight import simulate
+from rigidfleet.simulation.trajectories import trajectories
 from rigidfleet.sweep.store import read as load
 
 TOML = """
@@ -202,12 +203,24 @@ def test_vehicles_with_rotors(calm, quick):
 
 def test_words_for_nothing_may_wrap():
     """A sentence that stands for a worst value is in a column of words: it leaves the others their width."""
-    text = TOML.replace("separation = 1.0", "separation = 1.0\nseparation_below = 1.0")
-    page = page_contents([simulate(Mission.from_toml(text))], None, None)
-    table = page["safety"]
-    (row,) = (cells for cells in table.cell_texts if cells[0].startswith("separation below"))
-    (column,) = (k for k, cell in enumerate(row) if cell == "no agent flies below another")
+    alone = trajectories([0.0, 1.0], np.zeros((2, 1, 3)), separation=1.0)
+    table = page_contents([alone], None, None)["safety"]
+    (row,) = (cells for cells in table.cell_texts if cells[0].startswith("separation"))
+    (column,) = (k for k, cell in enumerate(row) if cell == "only one agent")
     assert table.names_units_words[column][2]
+
+
+def test_safety_has_no_row_of_what_does_not_apply():
+    """A limit that nothing can break, as nobody flies below another, has a row beside a flight that has the value."""
+    text = TOML.replace("separation = 1.0", "separation = 1.0\nseparation_below = 1.0")
+    apart = simulate(Mission.from_toml(text))
+    stacked = trajectories(
+        [0.0, 1.0], np.zeros((2, 2, 3)) + [[0, 0, 1], [0, 0, 9]], radius=0.2, limits={"separation_below": 1.0}
+    )  # fmt: skip
+    for flights, words in (([apart], None), ([apart, stacked], "no agent flies below another")):
+        table = page_contents(flights, None, None)["safety"]
+        rows = [cells for cells in table.cell_texts if cells[0].startswith("separation below")]
+        assert [row[1] for row in rows] == [words] * (words is not None)
 
 
 def test_legends_of_several_flights_are_whole(calm, hasty):
@@ -218,6 +231,16 @@ def test_legends_of_several_flights_are_whole(calm, hasty):
         rows = [str(e.get("transform")) for e in root.iter() if e.text in labels]
         assert len(rows) == 2
         assert len({row.split("(")[1].split(" ")[0] for row in rows}) == 1, rows
+
+
+def test_flights_side_by_side_have_no_empty_panel():
+    """What no flight has, as a lone trajectory has neither a separation nor a thrust, has no axes."""
+    way = np.linspace([[0.0, 0.0, 1.0]], [[3.0, 0.0, 1.0]], 4)
+    alone = trajectories(np.arange(4.0), way, cubic=True)
+    root = ET.fromstring(overlay.svg_of_time_curves([alone, alone], ["one", "other"]))
+    words = " ".join(e.text for e in root.iter() if e.text)
+    assert "greatest speed [m/s]" in words
+    assert not re.search(r"separation|thrust|clearance|constraint", words)
 
 
 def test_side_by_side(calm, hasty, quick):

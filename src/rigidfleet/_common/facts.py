@@ -76,8 +76,8 @@ class Line(NamedTuple):
     text: str
     level: Level = ""
 
-    def html(self) -> str:
-        """The sentence in a notebook."""
+    def html(self, _kind: str = "") -> str:
+        """The sentence in a notebook, or on a page beside tables of any kind."""
         return f"<p>{'<br>'.join(map(html.escape, self.text.splitlines()))}</p>"
 
     def __rich__(self) -> RenderableType:

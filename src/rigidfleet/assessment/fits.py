@@ -40,7 +40,7 @@ class Fit(NamedTuple):
     limit : the greatest error that the formation allows [m]
     error, pair, flown, intended : the greatest error of a distance [m], of which agents, and the two distances [m]
     is_mirrored : whether a spatial shape is the mirror image of its slots
-    points : where the best-fitting rotation turns the axis in the world: a unit vector (3,)
+    turned_axis : where the best-fitting rotation turns the axis in the world: a unit vector (3,)
     in_order : whether the agents of a line are in order; None for other shapes, and for two agents
     """
 

@@ -67,7 +67,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
     """Worst value of each quantity of a judged flight, with its limit if there is one.
 
     Limits are those of the verdict; those of the altitude are the geofence's. What the flight does not have, such as a
-    vehicle below another one, has no row.
+    vehicle below another one, has no row, limited or not.
     """
     measured, checks = Measurements(result), verdict.by_name
     rows = []
@@ -75,7 +75,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
         check = checks.get(q.name)
         if check is None and q.monitored and not q.way:
             check = limit_check(q, measured.worst(q.name), q.limit_of(result.mission), q.text)
-        if not (q.key or q.limit) or check is None or check.worst is check.limit is None:
+        if not (q.key or q.limit) or check is None or (check.worst is None and check.passed):
             continue
         limit, worst = check.limit, None
         if check.worst is not None and check.when is not None:

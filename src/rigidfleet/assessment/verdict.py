@@ -289,28 +289,41 @@ class Verdict(Shown):
         return worst
 
     @property
-    def summary(self) -> str:
-        """The verdict in words: the worst values of a flight that passed, or a line for each failed check.
+    def unkept_checks(self) -> list[CheckResult]:
+        """Checks that do not hold: the failures, then those that are undecided."""
+        return [*self.failures, *self.undecided_checks]
 
-        Then the phases in which a user's controller was not called.
-        """
-        uncalled = f"\n{self.uncalled[0].upper()}{self.uncalled[1:]}." if self.uncalled else ""
-        return self._verdict_in_words() + uncalled
+    @property
+    def head(self) -> str:
+        """How many checks fail or else are undecided, or that all hold, in words."""
+        judged = sum(check.judged for check in self.checks)
+        count = len(self.failures or self.undecided_checks)
+        return f"{count} of {judged} checks" if count else all_hold_in_words(judged)
 
-    def _verdict_in_words(self) -> str:
-        judged = [check for check in self.checks if check.judged]
-        if self.word != "passed":
-            some = self.failures or self.undecided_checks
-            lines = [*self.failures, *self.undecided_checks]
-            head = f"{self.word.capitalize()}: {len(some)} of {len(judged)} checks."
-            return "\n".join([head, *(f"- {check.message}" for check in lines)])
-        by_check = {f.check: f for f in self.checks if f.worst is not None}
+    @property
+    def praise(self) -> str:
+        """The worst values of a flight that passed, in words; "" for another."""
+        by_check = {
+            f.check: f for f in self.checks if f.worst is not None and not self.unkept_checks
+        }
         praise = {name: _PRAISE.get(name, quantity(name).praise) for name in by_check}
         if "thrust_peak" in by_check:
             praise["thrust"] = "{who} comes nearest to its limit, at {worst} of {limit}"
-        praise_lines = [by_check[name].fill(words) for name, words in praise.items() if words]
-        head = f"Passed: {all_hold_in_words(len(judged))}"
-        return (f"{head}; {', '.join(praise_lines)}." if praise_lines else f"{head}.") + self.covers
+        return ", ".join(by_check[name].fill(words) for name, words in praise.items() if words)
+
+    @property
+    def summary(self) -> str:
+        """The verdict in words: the worst values of a flight that passed, or a line for each check that does not hold.
+
+        Then the phases in which a user's controller was not called.
+        """
+        praise = f"; {self.praise}" if self.praise else ""
+        covers = "" if self.unkept_checks else self.covers
+        lines = [f"{self.word.capitalize()}: {self.head}{praise}.{covers}"]
+        lines += [f"- {check.message}" for check in self.unkept_checks]
+        if self.uncalled:
+            lines.append(f"{self.uncalled[0].upper()}{self.uncalled[1:]}.")
+        return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """The verdict as plain data that JSON can hold; None for what does not apply."""
@@ -338,12 +351,9 @@ class Verdict(Shown):
         return json.dumps(self.to_dict(), ensure_ascii=False, allow_nan=False, indent=2)
 
     def __repr__(self) -> str:
-        judged = [check for check in self.checks if check.judged]
-        failed = len(self.failures)
-        if self.word == "undecided":
-            return f"<Verdict {self.mission}: undecided in {len(self.undecided_checks)} of {len(judged)} checks>"
-        ending = f"failed {failed} of {len(judged)}" if failed else f"passed all {len(judged)}"
-        return f"<Verdict {self.mission}: {ending} checks>"
+        judged = sum(check.judged for check in self.checks)
+        words = {"failed": f"failed {self.head}", "undecided": f"undecided in {self.head}"}
+        return f"<Verdict {self.mission}: {words.get(self.word, f'passed all {judged} checks')}>"
 
     def facts(self) -> Sheet:
         """The tables of phases, waypoints and checks, the notes, and the verdict in words."""

@@ -90,30 +90,22 @@ def check(
         ]
         console.print_json({"mission": mission, "right": False, "findings": findings})
         return BAD_INPUT
-    if abort:
-        if out is not None:
-            home.write(out)
-        if json:
-            console.print_json({"mission": mission, "right": True} | home.data())
-        else:
-            console.out().print(home.facts())
-            if out is not None:
-                console.out().print(f"\nAborts   {out}", soft_wrap=True)
-        return PASSED
-    if figure is not None:
+    if abort and out is not None:
+        home.write(out)
+    if figure is not None and not abort:
         from rigidfleet.plotting.graph import draw_graphs
 
         judged = {f.name: f.rigidity for f in ahead.formations}
         draw_graphs(ahead.mission, judged, figure)
     if json:
-        console.print_json(
-            {"mission": mission, "right": True} | plain_facts(ahead.mission) | ahead.data()
-        )
-        return PASSED if ahead.passed else FAILED
-    console.out().print(ahead.facts())
-    if expand is not None:
-        console.out().print(f"\nMission  {expand}", soft_wrap=True)
-    return PASSED if ahead.passed else FAILED
+        data = home.data() if abort else plain_facts(ahead.mission) | ahead.data()
+        console.print_json({"mission": mission, "right": True} | data)
+    else:
+        console.out().print(home if abort else ahead)
+        for what, path in (("Aborts", out), ("Mission", expand)):
+            if path is not None:
+                console.out().print(f"\n{what:8} {path}", soft_wrap=True)
+    return PASSED if abort or ahead.passed else FAILED
 
 
 def plain_facts(mission: Mission) -> dict[str, object]:

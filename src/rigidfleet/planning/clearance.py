@@ -19,7 +19,7 @@ from rigidfleet.mission import Obstacle
 from rigidfleet.planning.derivatives import reference_of_agents, slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.solids.records import Solids
-from rigidfleet.typing import Floats, Ints
+from rigidfleet.typing import Bools, Floats, Ints
 
 #: Accuracy of a planned clearance [m].
 CLEARANCE_ACCURACY = 1e-3
@@ -104,8 +104,10 @@ class _Spans(NamedTuple):
         return _Spans(self.first[rows], self.length[rows], *kept, self.who[columns], self.halved)
 
 
-def clearance_to(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Floats) -> Closest:
-    """Least clearance of a planned phase to an obstacle in continuous time.
+def clearance_to(
+    planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Floats, lost: Bools | None = None
+) -> Closest:
+    """Least clearance of a planned phase to an obstacle in continuous time, of all agents but the ``lost``.
 
     ``speed`` is the `speed_bounds` of the phase. Where the room between two samples might not do, the plan is evaluated
     in the middle, and so on.
@@ -117,6 +119,8 @@ def clearance_to(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: 
     if not len(time):
         return Closest(np.inf, 0, float(planned.time[0]), np.inf)
     each, _ = proximity.obstacle_clearances(position, radius, [thing], time)
+    if lost is not None:
+        each[:, lost] = np.inf
     k, i = np.unravel_index(int(each.argmin()), each.shape)
     best, agent, when = float(each[k, i]), int(i), float(time[k])
     everybody, least, done = np.arange(each.shape[1]), np.inf, 0

@@ -133,9 +133,9 @@ def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
     """A bar for each vehicle while it is saturated."""
     from matplotlib.ticker import MaxNLocator
 
-    n, t = result.n_agents, result.time
+    n, t, q = result.n_agents, result.time, QUANTITIES["saturation"]
     if not saturated.any():
-        st.mark_empty(ax, "no vehicle is asked for more than its rotors give")
+        st.mark_empty(ax, q.nothing)
         return
     for i, colour in enumerate(st.agent_colours(n)):
         last = np.append(t, t[-1])
@@ -144,5 +144,4 @@ def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
     ax.set_ylim(n + 0.6, 0.4)
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_ylabel("saturated\nagent")
-    limit = QUANTITIES["saturation"].limit_of(result.mission)
-    st.write_above(ax, f"limit {limit:.3g} % of a phase")
+    st.write_above(ax, f"limit {q.limit_of(result.mission):.3g} % of a phase")

@@ -14,6 +14,7 @@ from rigidfleet._common.facts import (
     Cell,
     Fact,
     FactTable,
+    Level,
     Line,
     Row,
     Sheet,
@@ -51,7 +52,6 @@ _FORCES = {
     "air": "steady wind", "gusts": "gusts (3 sigma)", "weight": "weight error", "noise": "noise (3 sigma)",
 }  # fmt: skip
 
-Level = Literal["fails", "note"]
 #: What holds a formation in the phases that have it.
 HeldBy = Literal["tracking", "distances", "nothing"]
 

@@ -85,10 +85,10 @@ def loss_remarks(
     yield from _path_remarks(mission, preflight, phases)
     aborts = Aborts(mission, legs, mission.lost_at <= first)
     # Where the loss comes after a phase that ends by settling, where it falls is an estimate.
-    settles = any(x.phase.settle is not None for x in legs if x.start < first)
-    offset = steady_offset_remarks(mission, preflight, phases)
-    for remark in (*_wreck_remarks(aborts, phases), *offset):
-        yield replace(remark, level="note") if settles else remark
+    sure = all(x.phase.settle is None for x in legs if x.start < first)
+    yield from _wreck_remarks(aborts, phases, sure=sure)
+    for remark in steady_offset_remarks(mission, preflight, phases):
+        yield remark if sure else replace(remark, level="note")
 
 
 def _path_remarks(
@@ -102,7 +102,7 @@ def _path_remarks(
         yield from judge(mission, part)
 
 
-def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
+def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase], *, sure: bool) -> Iterator[Remark]:
     """Remarks on those left who hit a lost vehicle that falls or lies, at samples of the way after the loss."""
     left, radius = aborts.left, aborts.radius[aborts.left] - aborts.fall_uncertainty.max()
     for planned in way if aborts.wrecks else ():
@@ -111,8 +111,10 @@ def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase]) -> Iterator[Rema
         k, i = np.unravel_index(int(room.argmin()), room.shape)
         if room[k, i] < 0.0:
             wreck = aborts.wrecks[int(near[k, i])].name
-            text = f"agent {left[i] + 1} hits '{wreck}' at {time[k]:.2f} s in '{planned.phase}'"
-            yield Remark("fails", "loss", text)
+            text = (
+                f"{'hits' if sure else 'may hit'} '{wreck}' at {time[k]:.2f} s in '{planned.phase}'"
+            )
+            yield Remark("fails" if sure else "note", "loss", f"agent {left[i] + 1} {text}")
 
 
 def planned_answer_to_loss(mission: Mission, at: Leg, legs: Sequence[Leg]) -> Answer:

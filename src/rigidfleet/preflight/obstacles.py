@@ -10,7 +10,7 @@ import numpy as np
 from rigidfleet._common.quantities import PLACES, QUANTITIES
 from rigidfleet._common.waypoints import LEEWAY
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.mission import Mission, Obstacle, bounds
+from rigidfleet.mission import Mission, Obstacle
 from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
 from rigidfleet.mission.obstacles import Box, Ground
 from rigidfleet.planning.clearance import CLEARANCE_ACCURACY, clearance_to, speed_bounds
@@ -55,9 +55,8 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
             compared += planned.position[:, :, 0].size + _EACH
             if compared > _COMPARED:
                 break
-            # The lost are not near.
-            each = np.where(planned.leg.before.lost, -bounds.LENGTH.most, radius)
-            clearance, agent, time, proved = clearance_to(planned, thing, each, paces[k])
+            lost = planned.leg.before.lost
+            clearance, agent, time, proved = clearance_to(planned, thing, radius, paces[k], lost)
             if clearance - proved > max(unproved.get(b, 0.0), 1.5 * CLEARANCE_ACCURACY):
                 unproved[b] = clearance - proved
             # Among equal minima, take the first one: ignore rounding and the last millimetre of a rest.

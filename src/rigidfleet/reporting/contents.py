@@ -61,28 +61,30 @@ def page_contents(
     several = len(flights) > 1
     colours = plotting.agent_colours(len(flights))
     pages = [_flight_data(*each) for each in zip(flights, judged, names, colours, strict=True)]
-    # Trajectories that others made have no gains.
-    controlled = any(each["gains"] is not None and each["gains"].rows for each in pages)
-    # The summary, or the trajectory where a summary would be empty, has its own page.
-    drawn = plotting.figure_names(flights[0])[1:]
-    first: dict[str, Any] = {"brief": [], "sketch": None}
-    if not several:
+    if several:
+        own = {
+            "numbers": _number_comparison_table(flights, judged, names),
+            "keys": _differing_keys_table(missions, names),
+            "overlays": _overlay_pictures(flights, names),
+        }
+    else:
         falls = fall_places_by_sample(flights[0])
-        first["brief"] = brief.brief_rows(flights[0], judged[0], falls, **more)
-        first["sketch"] = _data_url(encode_figure(draw_ground(flights[0], falls), ["svg"])["svg"])
+        sketch = encode_figure(draw_ground(flights[0], falls), ["svg"])["svg"]
+        # The summary, or the trajectory where a summary would be empty, has its own page.
+        drawn = plotting.figure_names(flights[0])[1:]
+        own = {
+            "brief": brief.brief_rows(flights[0], judged[0], falls, **more),
+            "sketch": _data_url(sketch),
+            "figures": [_figure_for_page(flights[0], name) for name in drawn],
+        }
     return {
         "title": " · ".join(names),
         "several": several,
         "flights": pages,
-        **first,
-        "figures": [] if several else [_figure_for_page(flights[0], name) for name in drawn],
         "safety": _safety_table(flights, judged, names),
-        "numbers": _number_comparison_table(flights, judged, names) if several else None,
-        "keys": _differing_keys_table(missions, names) if several else None,
-        "overlays": _overlay_pictures(flights, names) if several else [],
-        "controlled": controlled,
         "version": __version__,
         "covers": _scope_in_words(flights),
+        **own,
     }
 
 
@@ -100,31 +102,24 @@ def _names_of(flights: Sequence[Result]) -> list[str]:
 
 def _flight_data(result: Result, verdict: Verdict, label: str, colour: str) -> dict[str, Any]:
     """What the template of a page shows of one flight, by the template's names."""
-    mission = result.mission
-    first, *rest = verdict.summary.split("\n")
-    head, _, praise = first.partition(": ")[2].partition("; ")
-    head = head.partition(".")[0]
-    failed = [line.removeprefix("- ") for line in rest if line.startswith("- ")]
     return {
         "label": label,
         "head_cell": Cell(label, colour=colour),
-        "name": mission.name,
-        "title": mission.title,
-        "source": mission.source,
-        "passed": verdict.passed,
-        "word": verdict.word,
-        "head": head,
-        "words": failed or [praise or verdict.covers],
-        "notes": [verdict.uncalled, *verdict.notes] if verdict.uncalled else verdict.notes,
+        "mission": result.mission,
+        "text": result.mission_text,
+        "verdict": verdict,
         "plan": brief.plan_sentences(result),
-        "phases": mission.phase_table,
-        "checks": [part for part in verdict.facts().shown_parts if isinstance(part, FactTable)],
+        # The notes, and the verdict in words, stand on the first page.
+        "checks": [
+            part
+            for part in verdict.facts().shown_parts
+            if isinstance(part, FactTable) or not part.level
+        ],
         "vehicles": _vehicles_table(result),
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
         "summary": _figure_for_page(result, plotting.figure_names(result)[0]),
         "gains": _gains_table(result),
         "digests": brief.provenance_sentences(result),
-        "text": result.mission_text,
     }
 
 
@@ -143,12 +138,11 @@ def _scope_in_words(flights: Sequence[Result]) -> str:
     )
 
 
-def _gains_table(result: Result) -> FactTable | None:
-    """The gains in words; None of trajectories that others made, which have none."""
-    if result.interpolation is not None:
-        return None
-    heads = ("gains", "value", "meaning")
-    return FactTable(heads, [*map(Row, gains.gain_lines(result.mission))], heads, bare=True)
+def _gains_table(result: Result) -> FactTable:
+    """The gains in words; trajectories that others made have none."""
+    heads, own = ("gains", "value", "meaning"), result.interpolation is None
+    lines = gains.gain_lines(result.mission) if own else []
+    return FactTable(heads, [*map(Row, lines)], heads, bare=True)
 
 
 def _vehicles_table(result: Result) -> FactTable:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from rigidfleet.result import Result
 
+#: Quantities that are drawn over time.
+_PANELS = "separation", "clearance", "thrust", "speed", "tracking_error", "constraint"
 _WIDTHS = (2.6, 0.9)  # of lines, first flight to last: each remains visible under the next
 
 
@@ -38,35 +40,31 @@ def svg_of_paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
 
 
 def svg_of_time_curves(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
-    """Distances, thrust, speed and errors over time, as an SVG."""
-    panels = ["separation", "thrust", "speed", "tracking_error", "constraint"]
-    if any(flight.mission.obstacles for flight in flights):
-        panels.insert(1, "clearance")
+    """Distances, thrust, speed and errors over time, as far as any flight has them, as an SVG."""
+    every = {name: [samples(flight, name).worst for flight in flights] for name in _PANELS}
+    known = {name: np.concatenate(x) for name, x in every.items()}
+    # A logarithmic axis shows no zero.
+    shown = [name for name, x in known.items() if x[np.isfinite(x)].any()] or ["speed"]
     with st.apply_style():
-        rows = (len(panels) + 1) // 2
+        rows = (len(shown) + 1) // 2
         fig = st.blank_figure(st.FIGURE_WIDTH, 0.6 + 1.9 * rows, "constrained")
         axes = fig.subplots(rows, 2, sharex=True, squeeze=False).ravel()
-        for ax, name in zip(axes, panels, strict=False):
-            known = False
-            for flight, look in zip(flights, _line_looks(flights), strict=True):
-                values = samples(flight, name).worst
-                ax.plot(flight.time, values, **look)
-                known |= bool(np.isfinite(values).any())
+        for ax, name in zip(axes, shown, strict=False):
+            for flight, worst, look in zip(flights, every[name], _line_looks(flights), strict=True):
+                ax.plot(flight.time, worst, **look)
             q, logarithmic = QUANTITIES[name], name in ("tracking_error", "constraint")
             for limit in dict.fromkeys(x for f in flights for x in distinct_limits(f.mission, q)):
                 st.draw_limit(ax, *limit)
-            worst = "least" if q.at_least else "greatest"
-            ax.set_title(f"{worst} {q.name_in_words} [{q.display_unit}]", loc="left")
-            if not known:
-                st.mark_empty(ax, "nothing to show")
-            elif logarithmic:
+            sense = "least" if q.at_least else "greatest"
+            ax.set_title(f"{sense} {q.name_in_words} [{q.display_unit}]", loc="left")
+            if logarithmic:
                 ax.set_yscale("log", nonpositive="clip")
                 ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-12))
             elif ax.get_ylim()[0] > 0:
                 ax.set_ylim(bottom=0)
-        for ax in axes[len(panels) :]:
+        for ax in axes[len(shown) :]:
             ax.set_visible(False)
-        for ax in axes[len(panels) - 2 : len(panels)]:
+        for ax in axes[max(len(shown) - 2, 0) : len(shown)]:
             ax.set_xlabel("time [s]")
             ax.tick_params(labelbottom=True)
         _add_flights_legend(fig, flights, labels)
