@@ -195,14 +195,28 @@ def with_gains(text: str, gains: Gains) -> str:
         keys = (table, key, *(int(k) - 1 for k in place))
         replace_value(wanted, whole, keys, lambda _, gain=gain: gain)
         new = _replace_line(new, table, key, to_toml({key: wanted[table][key]}).strip())
-    return new if toml_equals_data(new, wanted) else digest_lines(text) + to_toml(wanted)
+    if toml_equals_data(new, wanted):
+        return new
+    return (digest_lines(text) + to_toml(wanted)).replace("\n", _line_end(text))
 
 
 def _replace_line(text: str, table: str, key: str, line: str) -> str:
-    """The text with ``line`` in place of a key's, or below the table's header, or in a new table at the end."""
-    head = rf"(?m)(^[ \t]*\[\s*{table}\s*\].*\n)"
-    entry = rf"((?:(?!\s*\[).*\n)*?)[ \t]*{key}\s*=[^#\n]*?([ \t]*#.*)?$"
-    new, changed = re.subn(head + entry, lambda m: f"{m[1]}{m[2]}{line}{m[3] or ''}", text, count=1)
-    if not changed:
-        new, changed = re.subn(head, lambda m: f"{m[1]}{line}\n", text, count=1)
-    return new if changed else f"{text}\n[{table}]\n{line}\n"
+    """The text with ``line`` in place of a key's, or below the last key of its table, or in a new table at the end."""
+    end = _line_end(text)
+    lines = (text if text.endswith("\n") else text + end).split("\n")
+    heads = [k for k, own in enumerate(lines) if re.match(r"\s*\[", own)]
+    begin = next((k for k in heads if re.match(rf"\s*\[\s*{table}\s*\]", lines[k])), None)
+    if begin is None:
+        return "\n".join(lines) + end.join(["", f"[{table}]", line, ""])
+    table_lines = range(begin, min((k for k in heads if k > begin), default=len(lines)))
+    for k in table_lines:
+        if old := re.fullmatch(rf"(\s*){key}\s*=[^#]*?(\s*(?:#.*)?)", lines[k]):
+            lines[k] = f"{old[1]}{line}{old[2]}"
+            return "\n".join(lines)
+    last = max(k for k in table_lines if not re.match(r"\s*(#|$)", lines[k]))
+    return "\n".join([*lines[: last + 1], line + end[:-1], *lines[last + 1 :]])
+
+
+def _line_end(text: str) -> str:
+    """How the lines of a text end."""
+    return "\r\n" if "\r\n" in text else "\n"
