@@ -156,11 +156,30 @@ def test_a_log_is_cut_or_damaged(log, tmp_path):
     n = len(part.curves[0].time)
     assert 200 < n < len(whole.curves[0].time)
     np.testing.assert_allclose(at_samples(part)[1], at_samples(whole)[1][:n])
+    assert said(part, CUT)
     path.write_bytes(data[:150_000] + b"\xff" * 3000 + data[150_000:])
     part = read_trajectories(path)
     n = len(part.curves[0].time)
     np.testing.assert_allclose(at_samples(part)[1], at_samples(whole)[1][:n])
     assert said(part, "the log is damaged in part")
+
+
+CUT = "the log ends in the middle of a message"
+
+
+@pytest.mark.parametrize("name", ["cores.bin", "copter.tlog", "cube.ulg", "sitl.ulg"])
+def test_a_log_that_is_cut_short_is_told(log, name):
+    """A log that ends within a message says so, at whatever byte of it; one that ends with a message does not."""
+    if name.endswith("ulg"):
+        pytest.importorskip("pyulog")
+    path = log(name)
+    data = path.read_bytes()
+    assert not said(read_trajectories(path, gaps="bridge"), CUT)
+    for cut in (1, 2, 3, 5, 8, 9):
+        path.write_bytes(data[:-cut])
+        read = read_trajectories(path, gaps="bridge")
+        assert said(read, CUT)
+        assert not said(read, "damaged")
 
 
 # -- MAVLink -----------------------------------------------------------------------------------------
@@ -380,8 +399,11 @@ GPS = [("uint64_t", "timestamp"), ("uint64_t", "time_utc_usec"), ("int32_t", "la
 CODES = {"uint64_t": "Q", "float": "f", "double": "d", "uint8_t": "B", "bool": "?", "int32_t": "i"}
 
 
-def ulog(path: Path, topics, *, cut: int = 0) -> Path:
-    """A log after PX4's description of ULog; topics: name, number, fields, rows."""
+def ulog(path: Path, topics, *, cut: int = 0, appended: bytes = b"") -> Path:
+    """A log after PX4's description of ULog; topics: name, number, fields, rows.
+
+    Before what is ``appended``, at an offset that the flags have, the last message may be cut.
+    """
     message = lambda kind, body: struct.pack("<HB", len(body), ord(kind)) + body  # noqa: E731
     parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 1000), message("B", bytes(40))]
     forms = {name: fields for name, _, fields, _ in topics}
@@ -394,7 +416,10 @@ def ulog(path: Path, topics, *, cut: int = 0) -> Path:
         code = "<H" + "".join(CODES[kind] for kind, _ in fields)
         parts += [message("D", struct.pack(code, k, *row)) for row in rows]
     data = b"".join(parts)
-    path.write_bytes(data[: len(data) - cut])
+    data = data[: len(data) - cut]
+    if appended:
+        data = data[:27] + b"\1" + bytes(7) + struct.pack("<Q", len(data)) + data[43:] + appended
+    path.write_bytes(data)
     return path
 
 
@@ -567,6 +592,33 @@ def test_an_origin_that_moves_counts_from_then_on(tmp_path):
     assert rows_of(path, "ORGN", "Lat").tolist() == [[47.4], [47.401]]
 
 
+def test_an_origin_that_moves_counts_though_a_clock_begins_anew(tmp_path):
+    """After a vehicle or a station begins its clock anew, the origin is still the one that was stated last."""
+    pytest.importorskip("mcap")
+    local, _ = px4_rows(100)
+    for k, (_, fields) in enumerate(local):
+        begins = 500_000_000 * (k < 20)
+        fields["timestamp"] += begins
+        fields["timestamp_sample"] += begins
+        lat, lon, height = ORIGINS[k >= 60]
+        fields |= {"x": 0.02 * k - NORTH * (k >= 60), "y": 1.0, "z": -3.0, "xy_valid": True}
+        fields |= {"ref_lat": lat, "ref_lon": lon, "ref_alt": height}
+    path = px4_bag(tmp_path / "bag", "MCAP", 9, {("/p", "VehicleLocalPosition"): local})
+    read = read_trajectories(path, origin=ORIGINS[0])
+    assert said(read, "the clock begins anew")
+    np.testing.assert_allclose(at_samples(read)[1], FLOWN[20:], atol=5e-3)
+    messages = []
+    for k, (t, x, y, z, (lat, lon, height)) in enumerate(moved_rows()):
+        received = 1_700_000_000_000_000 + t - 20_000_000 * (k >= 20)
+        if k in (0, 50):
+            place = round(1e7 * lat), round(1e7 * lon), round(1e3 * height)
+            messages.append((received, 1, 1, "gps_global_origin", place))
+        row = (t // 1000, x, y, z, 0, 0, 0)
+        messages.append((received, 1, 1, "local_position_ned", row))
+    path = telemetry(tmp_path / "one.tlog", messages)
+    np.testing.assert_allclose(at_first_origin(path), FLOWN, atol=5e-3)
+
+
 #: Messages of ArduPilot: number, format and fields, after `LogStructure.h`; and how Python packs the format.
 DATAFLASH = {
     "XKF1": (10, "QBffffffc", "TimeUS,C,VN,VE,VD,PN,PE,PD,Yaw"), "ORGN": (11, "QBLLe", "TimeUS,Type,Lat,Lng,Alt"),
@@ -677,12 +729,30 @@ def test_a_ulog_is_cut(tmp_path):
     topics = [("vehicle_local_position", 0, LOCAL, list(local_rows(valid=0)))]
     read = read_trajectories(ulog(tmp_path / "cut.ulg", topics, cut=30))
     assert len(read.curves[0].time) == 99
+    assert said(read, CUT)
     (tmp_path / "head.ulg").write_bytes(b"ULog\x01\x12\x35\x01")
     with pytest.raises(TrajectoryError, match=r"head\.ulg: (the log is damaged|has no topic)"):
         read_trajectories(tmp_path / "head.ulg")
     (tmp_path / "text.tlog").write_text("this is no log\n" * 50)
     with pytest.raises(TrajectoryError, match=r"text\.tlog: has no topic with positions"):
         read_trajectories(tmp_path / "text.tlog")
+
+
+def test_what_is_appended_to_a_ulog_is_no_damage(tmp_path):
+    """A report of a crash begins where the flags say, though the message before was cut; damage is seen behind, too."""
+    pytest.importorskip("pyulog")
+    topics = [("vehicle_local_position", 0, LOCAL, list(local_rows(valid=0)))]
+    text = b"\x12char[4] hard_fault" + b"dump"
+    report = struct.pack("<HBB", 1 + len(text), ord("M"), 0) + text
+    for cut in (0, 1, 30, 45):
+        read = read_trajectories(ulog(tmp_path / "one.ulg", topics, cut=cut, appended=3 * report))
+        assert len(read.curves[0].time) == 100 - (cut > 0)
+        assert said(read, CUT) == (cut > 0)
+        assert not said(read, "damaged")
+        path = ulog(tmp_path / "one.ulg", topics, cut=cut, appended=report + b"\0\0\0" + report)
+        assert said(read_trajectories(path), "damaged")
+        path = ulog(tmp_path / "one.ulg", topics, cut=cut, appended=report[:-1])
+        assert said(read_trajectories(path), CUT)
 
 
 def test_a_package_that_is_missing_is_named(tmp_path, monkeypatch):

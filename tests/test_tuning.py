@@ -222,7 +222,7 @@ def test_gains_in_a_file(text, kept):
              WITHOUT, WITHOUT.rstrip(), "constraint = {alpha = 2.0}\n" + WITHOUT],
 )  # fmt: skip
 def test_lines_of_a_file_stay_as_they_are(text, end):
-    """Of a file, whatever ends its lines, new keys stand below those of their table, a new table below an empty line."""
+    """Whatever ends the lines of a file, new keys stand below those of their table, a new table below an empty line."""
     gains = {"constraint.alpha": 2.5, "constraint.gamma": 1.25, "tracking.Q.2": 9.0}
     new = with_gains(text.replace("\n", end), gains)
     assert new.endswith(end)

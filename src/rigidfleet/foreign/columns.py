@@ -19,7 +19,7 @@ from rigidfleet._common.names import (
 )
 from rigidfleet._common.tables import DEFAULT, SEPARATORS, TextTable, are_axes, fault, is_number
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.math.geodesy import matrix_to_enu
+from rigidfleet.math.geodesy import turn_to_enu
 from rigidfleet.typing import Floats, Ints
 
 #: Columns of a trajectory without names, as TUM's tools for trajectories of cameras write it.
@@ -213,7 +213,7 @@ def read_tracks(
             yaw = _yaw_of_clear_unit(table, values[own.yaw[0]][rows], time[rows], rows, notes)
         elif own.quaternion:
             yaw = yaws_of(stack(own.quaternion, rows))
-        turned = _turn_to_enu(own.axes, stack(own.place, rows), velocity, yaw)
+        turned = _track_to_enu(own.axes, stack(own.place, rows), velocity, yaw)
         tracks.append(Track(who, table.lines[rows], time[rows], *turned))
     named = table.kinds[main.place[0]].kind in DIRECTIONS
     said = "the option" if axes else "the file" if named else ""
@@ -386,17 +386,15 @@ def yaws_of(quaternions: Floats) -> Floats:
     return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
-def _turn_to_enu(
+def _track_to_enu(
     axes: str, place: Any, velocity: Floats | None, yaw: Floats | None
 ) -> tuple[Floats, Floats | None, Floats | None]:
     """Places, velocities (K, 3) and yaws (K,) in east, north, up; yaw turns from the first axis to the second."""
-    if axes == "enu":
-        return place, velocity, yaw
-    turn = matrix_to_enu(axes)
-    if yaw is not None:
-        x, y, up = turn[:, :2] @ np.stack([np.cos(yaw), np.sin(yaw)])
+    if yaw is not None and axes != "enu":  # whose turns count as they are
+        x, y, up = turn_to_enu(np.stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw], axis=1), axes).T
         yaw = None if up.any() else np.arctan2(y, x)
-    return place @ turn.T, None if velocity is None else velocity @ turn.T, yaw
+    velocity = None if velocity is None else turn_to_enu(velocity, axes)
+    return turn_to_enu(place, axes), velocity, yaw
 
 
 def _yaw_of_clear_unit(
