@@ -233,7 +233,9 @@ def test_lines_of_a_file_stay_as_they_are(text, end):
     if before[0].startswith("#"):  # else it is written anew
         kept = [x for x in before if "alpha" not in x]
         assert [x for x in lines if x in kept][: len(kept)] == kept
-        assert lines[lines.index("gamma = 1.25") - 1].lstrip().startswith(("alpha = 2.5", "R = 1.0"))
+        assert (
+            lines[lines.index("gamma = 1.25") - 1].lstrip().startswith(("alpha = 2.5", "R = 1.0"))
+        )
         k = lines.index("Q = [4.0, 9.0]")
         assert lines[k - 2 : k] == ["", "[tracking]"] or lines[k - 1] == "R = 1.0  # own"
 

@@ -83,13 +83,17 @@ def inline_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str,
 
 def digest_lines(text: str) -> str:
     """The lines of a mission's text that tell the digests of files, for a text that is written anew from its data."""
-    lines = re.findall(rf"^# .*{_DIGEST}[0-9a-f]{{64}}(?:{_DOUBTS}.*?)?(?=\r?$)", text, re.MULTILINE)
+    lines = re.findall(
+        rf"^# .*{_DIGEST}[0-9a-f]{{64}}(?:{_DOUBTS}.*?)?(?=\r?$)", text, re.MULTILINE
+    )
     return "".join(f"{line}\n" for line in dict.fromkeys(lines))
 
 
 def notes_on_files(text: str) -> list[str]:
     """What is said of the files of a mission's text, each with what was read of it."""
-    lines = re.findall(rf"^[ \t]*# (.*), {_DIGEST}[0-9a-f]{{64}}{_DOUBTS}(.*?)\r?$", text, re.MULTILINE)
+    lines = re.findall(
+        rf"^[ \t]*# (.*), {_DIGEST}[0-9a-f]{{64}}{_DOUBTS}(.*?)\r?$", text, re.MULTILINE
+    )
     return [f"{what}: {notes}" for what, notes in dict.fromkeys(lines)]
 
 
