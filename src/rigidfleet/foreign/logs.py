@@ -19,7 +19,6 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, redirect_stderr, redirect_stdout
 from fnmatch import fnmatchcase
 from importlib.util import find_spec
-from itertools import count
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,6 +27,7 @@ import numpy as np
 
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet._common.text import first_few
+from rigidfleet.foreign.columns import doubt_about_heights
 from rigidfleet.foreign.curves import ASSUMED, LoggedStates, Trajectories, curve_through_samples
 from rigidfleet.math.geodesy import Geodetic, enu_of, turn_to_enu
 from rigidfleet.math.piecewise import Piecewise
@@ -53,6 +53,7 @@ ULOG, BIN = b"ULog\x01\x12\x35", b"\xa3\x95"
 _ULOG_HEAD, _ULOG_KINDS = 16, frozenset(b"BFIMPQARDLCSO")
 DAMAGED = "the log is damaged in part: what could be read is judged"
 CUT = "the log ends in the middle of a message: it is judged up to there"
+_ELLIPSOID = "heights are above the ellipsoid, that of the origin is above mean sea level: up to 100 m beside it"
 GNSS = "that of the receiver of GNSS, true to its delay of some tenths of a second"
 
 
@@ -104,14 +105,18 @@ FORMS: dict[str, list[_Fields]] = {name: forms for *forms, names in (
 ) for name in names.split()}  # fmt: skip
 #: What else of logs of ArduPilot and MAVLink is read, by message, and fields by which a vehicle is armed.
 _BESIDE = {
-    "ORGN": "Lat Lng Alt Type", "XKV1": _VARIANCES, "NKV1": _VARIANCES, "XKF4": "PI", "NKF4": "PI", "ARM": "ArmState",
-    "GPS_GLOBAL_ORIGIN": "latitude longitude altitude", "HEARTBEAT": "base_mode autopilot", "BAD_DATA": "",
+    "ORGN": "Lat Lng Alt Type", "XKV1": _VARIANCES, "NKV1": _VARIANCES, "ARM": "ArmState",
+    "XKF4": "PI SS", "NKF4": "PI SS", "GPS_GLOBAL_ORIGIN": "latitude longitude altitude",
+    "HEARTBEAT": "base_mode autopilot", "BAD_DATA": "",
 }  # fmt: skip
 #: What fields are at least where a place is valid (a fix of GNSS in three dimensions is 3), and those that count how
 #: often an estimator set it anew.
 _VALID = dict.fromkeys(("xy_valid", "z_valid", "lat_lon_valid", "alt_valid", "is_ned"), 1)
-_VALID |= {"fix_type": 3, "Status": 3}
+_VALID |= {"fix_type": 3, "Status": 3, "has_place": 1}
 _RESETS = [f"{name}reset_counter" for name in ("xy_", "z_", "lat_lon_", "alt_", "")]
+#: Bits of the status of ArduPilot's filter (`AP_Nav_Common.h`): its place is known from its start, or on the Earth; its
+#: height is. Without them it writes where it was, or what a receiver says.
+_HORIZONTAL, _VERTICAL = 0b11000, 0b100000
 #: What MAVLink writes for a heading that is not known [0.01 deg], and who is no autopilot.
 _UNKNOWN, _NO_AUTOPILOT = 65535, 8
 #: Frames of the Earth of MAVLink's `MAV_FRAME`: local ones that are turned anyhow are not read.
@@ -231,7 +236,7 @@ def trajectories_of(
         A vehicle has no valid position.
     """
     tracks: dict[str, _Track] = {}
-    notes = {note: [""] for note in log.notes}
+    notes, above = {note: [""] for note in log.notes}, origin is not None
     several |= len(log.vehicles) > 1
     for who in sorted(log.vehicles, key=natural_sort_key):
         reasons, read = list[str](), list[tuple[Channel, _Track]]()
@@ -255,7 +260,8 @@ def trajectories_of(
         words = f"positions are those of {channel.topic}"
         if others := [c.topic for c in channels if c is not channel and not topics][:_LISTED]:
             words += f"; --topic may name {', '.join(others)}"
-        for note in (*[words] * (who != channel.topic), *reasons[:1], *track.notes):
+        other = [_ELLIPSOID] * (above and channel.message == "NavSatFix")
+        for note in (*[words] * (who != channel.topic), *reasons[:1], *track.notes, *other):
             notes.setdefault(note, []).append(who)
         tracks[who or stem], origin = track, origin or track.origin
     every = tracks.values()
@@ -340,7 +346,10 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     form = next((f for f in forms if {*f.place.split()} <= columns.keys()), None)
     if form is None:
         raise fault(f"{channel.topic}: its messages are of a form that is not known")
-    frame = next((f for f in ("ned", "enu") if channel.frame.endswith(f"_{f}")), form.frame)
+    # The last word of the name of a frame says its axes, those of places on the Earth but where their receiver is.
+    named = re.split(r"[^A-Za-z]|(?<=[a-z])(?=[A-Z])", channel.frame)[-1].lower()
+    assumed = form.frame == "geodetic" or named not in ("ned", "enu")
+    frame = form.frame if assumed else named
     place = _stack_columns(columns, form.place) * form.units[:3]
     known = np.asarray(np.abs(place) < FAR).all(axis=1)
     known &= (place[:, :2] != 0.0).any(axis=1) | (frame != "geodetic")
@@ -366,6 +375,8 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
         origin = origin or (*place[0].tolist(),)
         place = enu_of(place, origin)
     else:
+        if frame == "enu" and assumed and (words := doubt_about_heights(place[:, 2])):
+            notes.append(f"{words} The name of its frame, {channel.frame!r}, would end in _ned")
         place = turn_to_enu(place, axes)
         if reference is not None:
             origin = origin or (*reference[-1].tolist(),)
@@ -437,8 +448,12 @@ def _origins_at(order: Any, stated: dict[str, Any], names: str, units: Any = 1.0
     known = np.isfinite(place).all(axis=1) & (place[:, :2] != 0.0).any(axis=1)
     if not known.any():
         return None
-    k = np.searchsorted(stated["order"][known], order, side="right") - 1
-    return place[known][np.maximum(k, 0)]
+    return _latest(order, stated["order"][known], place[known])
+
+
+def _latest(order: Any, stated: Any, values: Any) -> Any:
+    """Of values that were stated in order the last ones at some places in it; at first the first."""
+    return values[np.maximum(np.searchsorted(stated, order, side="right") - 1, 0)]
 
 
 def _read_ulog(path: Path) -> Log:
@@ -507,9 +522,8 @@ def _collect_columns(log: Any) -> dict[tuple[int, str, int], dict[str, Any]]:
     for name, ((_, *own, _), *_) in FORMS.items():
         names[name] = [*" ".join(own).split(), "frame_id", *_RESETS, *_VALID]
     rows: dict[tuple[int, str, int], array[float]] = defaultdict(lambda: array("d"))
-    for number in count():
-        if (message := log.recv_match(type=[*names])) is None:
-            break
+    messages = iter(lambda: log.recv_match(type=[*names]), None)
+    for number, message in enumerate(messages):
         kind, received = message.get_type(), message._timestamp
         who, lane = 0, getattr(message, "C", getattr(message, "I", 0))
         if hasattr(message, "get_srcSystem"):
@@ -517,7 +531,8 @@ def _collect_columns(log: Any) -> dict[tuple[int, str, int], dict[str, Any]]:
         stamp = getattr(message, "time_usec", 0.0) / 1e6 or received
         stamp = getattr(message, "time_boot_ms", 1e3 * stamp) / 1e3
         own = (_number_of(message, *name.split("[")) for name in names[kind])
-        rows[who, kind, 0 if kind in _BESIDE else lane].extend((number, stamp, received, *own))
+        laned = kind in FORMS or kind[1:] == "KF4"
+        rows[who, kind, lane if laned else 0].extend((number, stamp, received, *own))
     table = {}
     for key, numbers in rows.items():
         own = np.frombuffer(numbers).reshape(-1, 3 + len(names[key[1]])).T
@@ -560,14 +575,18 @@ def _read_bin(path: Path) -> Log:
     for (_, kind, lane), columns in table.items():
         if kind in _BESIDE:
             continue
-        dated, own = bool(columns["time"][0] > _DATES), beside.get(f"{kind[0]}KF4")
+        # What the same core says of itself; other messages have no such.
+        dated, own = bool(columns["time"][0] > _DATES), table.get((0, f"{kind[0]}KF4", lane), {})
         del columns["received"]
-        main = lane == (int(np.median(own["PI"])) if own and kind[1:] == "KF1" else 0)
-        if main and own and kind[1:] == "KF1" and (share := float(np.mean(own["PI"] != lane))):
+        main = lane == (int(np.median(own["PI"])) if own else 0)
+        if "SS" in own:
+            status = _latest(columns["order"], own["order"], own["SS"]).astype(int)
+            columns["has_place"] = (status & _HORIZONTAL > 0) & (status & _VERTICAL > 0)
+        if main and own and (share := float(np.mean(own["PI"] != lane))):
             notes += (
                 f"in {100 * share:.2g} % of the log, the estimator trusted another core than {kind}:{lane}",
             )
-        if main and kind[1:] == "KF1" and (own := beside.get(f"{kind[0]}KV1")):
+        if main and (own := beside.get(f"{kind[0]}KV1")):
             at = columns["time"], own["time"]
             columns |= {name: np.interp(*at, own[name]) for name in _VARIANCES.split()}
         place = _origins_at(columns["order"], origin, "Lat Lng Alt")

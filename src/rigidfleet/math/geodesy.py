@@ -19,11 +19,8 @@ def turn_to_enu(vectors: ArrayLike, axes: str) -> Floats:
 
     What is not finite along one axis stays there. From "ned" and back is the same.
     """
-    vectors = np.asarray(vectors, dtype=np.float64)
-    turned = np.zeros_like(vectors)
-    for k, (axis, sign) in enumerate(AXES[letter] for letter in axes):
-        turned[..., axis] = sign * vectors[..., k]
-    return turned
+    along, signs = zip(*(AXES[letter] for letter in axes), strict=True)
+    return np.multiply(vectors, signs)[..., np.argsort(along)]
 
 
 def enu_of(geodetic: ArrayLike, origin: Geodetic) -> Floats:
