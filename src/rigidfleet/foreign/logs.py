@@ -342,8 +342,7 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
         It has no valid one.
     """
     columns, notes, reference = channel.columns, [], channel.reference
-    forms = FORMS[channel.message]
-    form = next((f for f in forms if {*f.place.split()} <= columns.keys()), None)
+    form = next((f for f in FORMS[channel.message] if {*f.place.split()} <= columns.keys()), None)
     if form is None:
         raise fault(f"{channel.topic}: its messages are of a form that is not known")
     # The last word of the name of a frame says its axes, those of places on the Earth but where their receiver is.
