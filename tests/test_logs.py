@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -93,11 +94,20 @@ def rows_of(path: Path, kind: str, *names: str, **only) -> np.ndarray:
     return np.array(rows, dtype=float)
 
 
+def has_place(path: Path, core: int) -> np.ndarray:
+    """Whether each place of a core counts: a message before it says that one over ground is known, and a height."""
+    status = rows_of(path, "XKF4", "SS", C=core)[:, 0].astype(int)
+    return (status & 0b11000 > 0) & (status & 0b100000 > 0)
+
+
 def test_the_primary_core_of_ardupilot_is_read(log):
     """Of three cores the primary one: north, east, down in metres become east, north, up, as are velocities."""
     path = log("cores.bin")
     own = rows_of(path, "XKF1", "PN", "PE", "PD", "VN", "VE", "VD", "Yaw", "_timestamp", C=0)
+    own = own[has_place(path, 0)]
+    assert len(own) == 445
     read = read_trajectories(path)
+    assert said(read, "58 samples without a valid position are left out")
     time, place = at_samples(read)
     np.testing.assert_allclose(place, own[:, [1, 0, 2]] * [1, 1, -1], atol=1e-12)
     np.testing.assert_allclose(measured(read).velocity, own[:, [4, 3, 5]] * [1, 1, -1])
@@ -107,7 +117,7 @@ def test_the_primary_core_of_ardupilot_is_read(log):
     assert said(read, "positions are those of XKF1; --topic may name")
     assert read.read[0]["origin"] == pytest.approx([38.3149933, 26.6360348, 66.63])
     other = read_trajectories(path, topic="XKF1:2")
-    own = rows_of(path, "XKF1", "PE", C=2)
+    own = rows_of(path, "XKF1", "PE", C=2)[has_place(path, 2)]
     np.testing.assert_allclose(at_samples(other)[1][:, 0], own[:, 0], atol=1e-12)
 
 
@@ -116,6 +126,7 @@ def test_variances_of_a_filter_are_those_of_its_position(log):
     path = log("cores.bin")
     own = rows_of(path, "XKV1", "V07", "V08", "V09", "_timestamp")
     read = read_trajectories(path)
+    own = own[own[:, 3] >= read.since + read.curves[0].time[0]]
     at = [np.interp(own[:, 3] - read.since, read.curves[0].time, x)
           for x in measured(read).deviation.T]  # fmt: skip
     np.testing.assert_allclose(np.stack(at, 1), np.sqrt(own[:, [1, 0, 2]]), rtol=0.05)
@@ -130,7 +141,8 @@ def test_local_and_geodetic_positions_of_a_flight_agree(log):
     )
     north = rows_of(path, "POS", "Lat", "Lng", "Alt")
     np.testing.assert_allclose(geodetic, flat(*north.T, origin), atol=1e-3)
-    np.testing.assert_allclose(t, u, atol=0.01)
+    u, geodetic = u[-len(t) :] - u[-1], geodetic[-len(t) :]  # the filter knows its place later
+    np.testing.assert_allclose(t - t[-1], u, atol=0.01)
     np.testing.assert_allclose(local[:, :2], geodetic[:, :2], atol=0.05)
     np.testing.assert_allclose(local[:, 2], geodetic[:, 2], atol=0.2)
 
@@ -156,11 +168,30 @@ def test_a_log_is_cut_or_damaged(log, tmp_path):
     n = len(part.curves[0].time)
     assert 200 < n < len(whole.curves[0].time)
     np.testing.assert_allclose(at_samples(part)[1], at_samples(whole)[1][:n])
+    assert said(part, CUT)
     path.write_bytes(data[:150_000] + b"\xff" * 3000 + data[150_000:])
     part = read_trajectories(path)
     n = len(part.curves[0].time)
     np.testing.assert_allclose(at_samples(part)[1], at_samples(whole)[1][:n])
     assert said(part, "the log is damaged in part")
+
+
+CUT = "the log ends in the middle of a message"
+
+
+@pytest.mark.parametrize("name", ["cores.bin", "copter.tlog", "cube.ulg", "sitl.ulg"])
+def test_a_log_that_is_cut_short_is_told(log, name):
+    """A log that ends within a message says so, at whatever byte of it; one that ends with a message does not."""
+    if name.endswith("ulg"):
+        pytest.importorskip("pyulog")
+    path = log(name)
+    data = path.read_bytes()
+    assert not said(read_trajectories(path, gaps="bridge"), CUT)
+    for cut in (1, 2, 3, 5, 8, 9):
+        path.write_bytes(data[:-cut])
+        read = read_trajectories(path, gaps="bridge")
+        assert said(read, CUT)
+        assert not said(read, "damaged")
 
 
 # -- MAVLink -----------------------------------------------------------------------------------------
@@ -366,7 +397,7 @@ def test_jumps_of_an_estimator_are_told(log, tmp_path):
     path.write_bytes(data)
     read = read_trajectories(path)
     (note,) = (x for x in read.notes if "the estimator moves" in x)
-    assert re.search(r"by 1\.[4-7]\d* m at 30\.0", note), note
+    assert re.search(r"by 1\.[4-7]\d* m at 24\.2", note), note
 
 
 # -- PX4 ---------------------------------------------------------------------------------------------
@@ -380,8 +411,11 @@ GPS = [("uint64_t", "timestamp"), ("uint64_t", "time_utc_usec"), ("int32_t", "la
 CODES = {"uint64_t": "Q", "float": "f", "double": "d", "uint8_t": "B", "bool": "?", "int32_t": "i"}
 
 
-def ulog(path: Path, topics, *, cut: int = 0) -> Path:
-    """A log after PX4's description of ULog; topics: name, number, fields, rows."""
+def ulog(path: Path, topics, *, cut: int = 0, appended: bytes = b"") -> Path:
+    """A log after PX4's description of ULog; topics: name, number, fields, rows.
+
+    Before what is ``appended``, at an offset that the flags have, the last message may be cut.
+    """
     message = lambda kind, body: struct.pack("<HB", len(body), ord(kind)) + body  # noqa: E731
     parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 1000), message("B", bytes(40))]
     forms = {name: fields for name, _, fields, _ in topics}
@@ -394,7 +428,10 @@ def ulog(path: Path, topics, *, cut: int = 0) -> Path:
         code = "<H" + "".join(CODES[kind] for kind, _ in fields)
         parts += [message("D", struct.pack(code, k, *row)) for row in rows]
     data = b"".join(parts)
-    path.write_bytes(data[: len(data) - cut])
+    data = data[: len(data) - cut]
+    if appended:
+        data = data[:27] + b"\1" + bytes(7) + struct.pack("<Q", len(data)) + data[43:] + appended
+    path.write_bytes(data)
     return path
 
 
@@ -567,12 +604,39 @@ def test_an_origin_that_moves_counts_from_then_on(tmp_path):
     assert rows_of(path, "ORGN", "Lat").tolist() == [[47.4], [47.401]]
 
 
+def test_an_origin_that_moves_counts_though_a_clock_begins_anew(tmp_path):
+    """After a vehicle or a station begins its clock anew, the origin is still the one that was stated last."""
+    pytest.importorskip("mcap")
+    local, _ = px4_rows(100)
+    for k, (_, fields) in enumerate(local):
+        begins = 500_000_000 * (k < 20)
+        fields["timestamp"] += begins
+        fields["timestamp_sample"] += begins
+        lat, lon, height = ORIGINS[k >= 60]
+        fields |= {"x": 0.02 * k - NORTH * (k >= 60), "y": 1.0, "z": -3.0, "xy_valid": True}
+        fields |= {"ref_lat": lat, "ref_lon": lon, "ref_alt": height}
+    path = px4_bag(tmp_path / "bag", "MCAP", 9, {("/p", "VehicleLocalPosition"): local})
+    read = read_trajectories(path, origin=ORIGINS[0])
+    assert said(read, "the clock begins anew")
+    np.testing.assert_allclose(at_samples(read)[1], FLOWN[20:], atol=5e-3)
+    messages = []
+    for k, (t, x, y, z, (lat, lon, height)) in enumerate(moved_rows()):
+        received = 1_700_000_000_000_000 + t - 20_000_000 * (k >= 20)
+        if k in (0, 50):
+            place = round(1e7 * lat), round(1e7 * lon), round(1e3 * height)
+            messages.append((received, 1, 1, "gps_global_origin", place))
+        row = (t // 1000, x, y, z, 0, 0, 0)
+        messages.append((received, 1, 1, "local_position_ned", row))
+    path = telemetry(tmp_path / "one.tlog", messages)
+    np.testing.assert_allclose(at_first_origin(path), FLOWN, atol=5e-3)
+
+
 #: Messages of ArduPilot: number, format and fields, after `LogStructure.h`; and how Python packs the format.
 DATAFLASH = {
     "XKF1": (10, "QBffffffc", "TimeUS,C,VN,VE,VD,PN,PE,PD,Yaw"), "ORGN": (11, "QBLLe", "TimeUS,Type,Lat,Lng,Alt"),
-    "XKF4": (12, "QBB", "TimeUS,C,PI"),
+    "XKF4": (12, "QBHB", "TimeUS,C,SS,PI"),
 }  # fmt: skip
-PACKS = {"Q": "Q", "B": "B", "f": "f", "c": "h", "L": "i", "e": "i"}
+PACKS = {"Q": "Q", "B": "B", "H": "H", "f": "f", "c": "h", "L": "i", "e": "i"}
 
 
 def dataflash(path: Path, messages) -> Path:
@@ -596,10 +660,30 @@ def test_a_core_that_was_not_trusted_is_told(tmp_path):
     for k in range(100):
         t = 1_000_000 + 20_000 * k
         parts += [("XKF1", (t, core, 0, 0, 0, 0.02 * k, 1.0 + core, -3.0, 0)) for core in (0, 1)]
-        parts.append(("XKF4", (t, 0, int(k >= 80))))
+        parts.append(("XKF4", (t, 0, 0b111111, int(k >= 80))))
     read = read_trajectories(dataflash(tmp_path / "one.bin", parts))
     np.testing.assert_allclose(at_samples(read)[1], FLOWN, atol=1e-6)
     assert said(read, "in 20 % of the log, the estimator trusted another core than XKF1:0")
+
+
+def test_a_filter_that_knows_no_place_tells_none(tmp_path):
+    """What ArduPilot's filter writes while it says that it knows no place, or no height, is left out, core by core."""
+    pytest.importorskip("pymavlink")
+    parts = []
+    for k in range(100):
+        t = 1_000_000 + 20_000 * k
+        for core in (0, 1):
+            status = (
+                0b10000111 if k < 10 else 0b11111 if k < 20 else 0b110111 if k % 2 else 0b101111
+            )
+            parts.append(("XKF4", (t, core, 0b10000111 if core else status, 0)))
+            parts.append(("XKF1", (t, core, 0, 0, 0, 0.02 * k if k >= 20 else 0, 1.0, -3.0, 0)))
+    path = dataflash(tmp_path / "one.bin", parts)
+    read = read_trajectories(path)
+    np.testing.assert_allclose(at_samples(read)[1], FLOWN[20:], atol=1e-6)
+    assert said(read, "20 samples without a valid position are left out")
+    with pytest.raises(TrajectoryError, match="XKF1:1: no position is valid"):
+        read_trajectories(path, topic="XKF1:1")
 
 
 def test_a_message_of_which_little_is_valid_gives_way_to_another(tmp_path):
@@ -677,12 +761,30 @@ def test_a_ulog_is_cut(tmp_path):
     topics = [("vehicle_local_position", 0, LOCAL, list(local_rows(valid=0)))]
     read = read_trajectories(ulog(tmp_path / "cut.ulg", topics, cut=30))
     assert len(read.curves[0].time) == 99
+    assert said(read, CUT)
     (tmp_path / "head.ulg").write_bytes(b"ULog\x01\x12\x35\x01")
     with pytest.raises(TrajectoryError, match=r"head\.ulg: (the log is damaged|has no topic)"):
         read_trajectories(tmp_path / "head.ulg")
     (tmp_path / "text.tlog").write_text("this is no log\n" * 50)
     with pytest.raises(TrajectoryError, match=r"text\.tlog: has no topic with positions"):
         read_trajectories(tmp_path / "text.tlog")
+
+
+def test_what_is_appended_to_a_ulog_is_no_damage(tmp_path):
+    """A report of a crash begins where the flags say, though the message before was cut; damage is seen behind, too."""
+    pytest.importorskip("pyulog")
+    topics = [("vehicle_local_position", 0, LOCAL, list(local_rows(valid=0)))]
+    text = b"\x12char[4] hard_fault" + b"dump"
+    report = struct.pack("<HBB", 1 + len(text), ord("M"), 0) + text
+    for cut in (0, 1, 30, 45):
+        read = read_trajectories(ulog(tmp_path / "one.ulg", topics, cut=cut, appended=3 * report))
+        assert len(read.curves[0].time) == 100 - (cut > 0)
+        assert said(read, CUT) == (cut > 0)
+        assert not said(read, "damaged")
+        path = ulog(tmp_path / "one.ulg", topics, cut=cut, appended=report + b"\0\0\0" + report)
+        assert said(read_trajectories(path), "damaged")
+        path = ulog(tmp_path / "one.ulg", topics, cut=cut, appended=report[:-1])
+        assert said(read_trajectories(path), CUT)
 
 
 def test_a_package_that_is_missing_is_named(tmp_path, monkeypatch):
@@ -829,9 +931,9 @@ def test_a_robot_that_others_recorded(tmp_path, storage):
 
 
 def poses_bag(
-    folder: Path, rows: list[tuple[str, int, int, list[float]]], packed: str = "", plugin: str = "MCAP"
+    folder: Path, rows: list[tuple[Any, ...]], packed: str = "", plugin: str = "MCAP"
 ) -> Path:  # fmt: skip
-    """A recording that `rosbags` writes, of poses: topic, when it was recorded and stamped [ns], place [m]."""
+    """A recording that `rosbags` writes, of poses: topic, when it was recorded and stamped [ns], place [m], frame."""
     rosbag2 = pytest.importorskip("rosbags.rosbag2")
     pytest.importorskip("mcap")
     from rosbags.rosbag2.enums import CompressionFormat, CompressionMode, StoragePlugin
@@ -844,10 +946,10 @@ def poses_bag(
     if packed:
         writer.set_compression(CompressionMode[packed], CompressionFormat.ZSTD)
     with writer:
-        for topic, received, stamp, place in rows:
+        for topic, received, stamp, place, *frame in rows:
             if topic not in to:
                 to[topic] = writer.add_connection(topic, kind, typestore=store)
-            header = of["Header"](of["Time"](stamp // 10**9, stamp % 10**9), "map")
+            header = of["Header"](of["Time"](stamp // 10**9, stamp % 10**9), *(frame or ["map"]))
             pose = of["Pose"](of["Point"](*place), of["Quaternion"](0.0, 0.0, 0.0, 1.0))
             data = store.serialize_cdr(of["PoseStamped"](header, pose), kind)
             writer.write(to[topic], received, data)
@@ -990,7 +1092,7 @@ def test_a_body_in_two_frames_is_in_the_first(tmp_path):
     )
     read = read_trajectories(path)
     np.testing.assert_allclose(at_samples(read)[1][:, 0], 0.1 * np.arange(50))
-    assert said(read, "/tf:cf1 in 'camera' is not read: it is in 'world' first")
+    assert said(read, "/tf:cf1 in 'camera' is not read: it is TFMessage in 'world' first")
 
 
 def test_where_vehicles_are_to_be_is_no_vehicle(tmp_path):
@@ -1255,6 +1357,73 @@ def test_messages_of_px4_are_read_from_recordings(tmp_path, plugin, version):
     np.testing.assert_allclose(measured(read).deviation, [[0.25, 0.5, 1.0]] * 50)
 
 
+@pytest.mark.parametrize(
+    ("change", "right"),
+    [
+        (lambda text: text.replace("\n", "\r\n"), True),
+        (lambda text: text.replace("float32 x\n", "float32 x 0.0  # north\n\n# = [m]\n"), True),
+        (lambda text: "uint32 A=1\n" + text, True),
+        (lambda text: text.replace("float32 vx", "px4_msgs/Other vx"), False),
+        (lambda text: text.replace("float32 x", "float32[<=3] x"), False),
+        (lambda text: text.replace("bool xy_valid", "string[] xy_valid"), False),
+        (lambda text: "module px4_msgs {\n" + text, False),
+    ],
+)
+def test_a_definition_is_read_whole_or_not(tmp_path, change, right):
+    """Fields are where the recording says, however its lines end; with one that is not known, none is guessed."""
+    topic = "/fmu/out/vehicle_local_position"
+    local, _ = px4_rows()
+    path = px4_bag(tmp_path / "bag", "SQLITE3", 9, {(topic, "VehicleLocalPosition"): local})
+    with closing(sqlite3.connect(next(path.glob("*.db3")))) as base:
+        text = change(PX4["VehicleLocalPosition"].replace("        ", ""))
+        base.execute("UPDATE message_definitions SET encoded_message_definition = ?", [text])
+        base.commit()
+    if right:
+        wanted = np.array([[f["y"], f["x"], -f["z"]] for _, f in local])
+        np.testing.assert_allclose(at_samples(read_trajectories(path))[1], wanted[5:], atol=1e-6)
+    else:
+        with pytest.raises(TrajectoryError, match=r"px4_msgs.* definition is not understood"):
+            read_trajectories(path)
+
+
+def test_another_kind_of_cdr_is_refused(tmp_path):
+    """Numbers of the second version of CDR, which are aligned in another way, are not read as those of the first."""
+    path = poses_bag(tmp_path / "bag", OF_THREE, plugin="SQLITE3")
+    assert len(read_trajectories(path).names) == 3
+    with closing(sqlite3.connect(path)) as base:
+        base.execute("UPDATE messages SET data = CAST(X'00070000' || substr(data, 5) AS BLOB)")
+        base.commit()
+    with pytest.raises(TrajectoryError, match="is encoded in CDR 0007, not in plain CDR"):
+        read_trajectories(path)
+
+
+@pytest.mark.parametrize(
+    ("frame", "turned"),
+    [("map_ned", True), ("ned", True), ("/uav1/NED", True), ("localNED", True), ("world-ned", True),
+     ("map", False), ("enu", False), ("map_ENU", False), ("aligned", False), ("", False)],
+)  # fmt: skip
+def test_a_frame_is_named_by_its_last_word(tmp_path, frame, turned):
+    """A frame whose last word is ned is north, east, down; of heights that nobody explains there is a doubt."""
+    begin = 1_700_000_000 * 10**9
+    rows = [("/a", begin + t, begin + t, [1e-9 * t, 1.0, -3.0], frame)
+            for t in range(0, 10**9, 20_000_000)]  # fmt: skip
+    read = read_trajectories(poses_bag(tmp_path / "bag", rows))
+    k = np.arange(50) * 0.02
+    wanted = [1.0 + 0 * k, k, 3.0 + 0 * k] if turned else [k, 1.0 + 0 * k, -3.0 + 0 * k]
+    np.testing.assert_allclose(at_samples(read)[1], np.stack(wanted, 1), atol=1e-9)
+    assert said(read, "does z point down?") == (not turned and not frame.lower().endswith("enu"))
+
+
+def test_places_before_their_frame_is_named_are_told(tmp_path):
+    """Places of a topic in a frame without a name, before others in one with a name, do not vanish unsaid."""
+    begin = 1_700_000_000 * 10**9
+    rows = [("/a", begin + t, begin + t, [1e-9 * t, 1.0, 3.0], "map" if t >= 4e8 else "")
+            for t in range(0, 10**9, 20_000_000)]  # fmt: skip
+    read = read_trajectories(poses_bag(tmp_path / "bag", rows))
+    assert len(read.curves[0].time) == 30
+    assert said(read, "/a in '' is not read: it is in 'map' later")
+
+
 def test_what_is_no_log_is_refused_by_name(tmp_path):
     """A path that is planned, PX4's messages without their definition, and frames that are turned anyhow."""
     _, odometry = px4_rows()
@@ -1286,13 +1455,20 @@ def test_what_is_no_log_is_refused_by_name(tmp_path):
 
 def test_fixes_of_ros_are_places_on_the_earth(log):
     """Latitudes and longitudes of NavSatFix in degrees become east, north, up; without a fix, there is no place."""
-    read = read_trajectories(log("fixes.mcap"), topic="/fix", origin=(47.4, 8.5, 500.0))
+    path = log("fixes.mcap")
+    read = read_trajectories(path, topic="/fix", origin=(47.4, 8.5, 500.0))
     place = at_samples(read)[1]
     k = np.arange(1, 200)
     np.testing.assert_allclose(
         place, flat(47.4 + 1e-7 * k, 8.5 + 0.0 * k, 500.0 + 0.01 * k, (47.4, 8.5, 500.0)), atol=2e-3
     )
     assert said(read, "1 samples without a valid position are left out")
+    assert said(read, "heights are above the ellipsoid, that of the origin is above mean sea level")
+    own = read_trajectories(path, topic="/fix")
+    np.testing.assert_allclose(
+        np.diff(at_samples(own)[1], axis=0), np.diff(place, axis=0), atol=1e-6
+    )
+    assert not said(own, "ellipsoid")
 
 
 def test_damaged_logs_are_one_error(log, tmp_path, capfd):

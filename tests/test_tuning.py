@@ -18,6 +18,7 @@ import rigidfleet as rf
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes
 from rigidfleet.errors import ResultError, RigidfleetError, SweepError
+from rigidfleet.mission.files import digest_lines, notes_on_files
 from rigidfleet.sweep import Sweep, metrics, read
 from rigidfleet.tuning.gains import RANGES, GainSpace, Screen, own_gains, with_gains
 from rigidfleet.tuning.outcome import Flown
@@ -213,6 +214,49 @@ def test_gains_in_a_file(text, kept):
     assert ("# a pair of quadrotors" in new) == kept
     assert not kept or ("# [1/s]" in new and "# the rest" in new)
     rf.Mission.from_toml(new)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize(
+    "text", [TEXT, TEXT + "\n[tracking]\nR = 1.0  # own", TEXT.replace("alpha = 3.0 ", "  beta = 2\n  alpha = 3 "),
+             WITHOUT, WITHOUT.rstrip(), "constraint = {alpha = 2.0}\n" + WITHOUT],
+)  # fmt: skip
+def test_lines_of_a_file_stay_as_they_are(text, end):
+    """Whatever ends the lines of a file, new keys stand below those of their table, a new table below an empty line."""
+    gains = {"constraint.alpha": 2.5, "constraint.gamma": 1.25, "tracking.Q.2": 9.0}
+    new = with_gains(text.replace("\n", end), gains)
+    assert new.endswith(end)
+    assert new.count("\n") == new.count(end)
+    assert new.count("\r") == new.count("\r\n")
+    lines, before = new.split(end), text.split("\n")
+    assert new == with_gains(text, gains).replace("\n", end)
+    if before[0].startswith("#"):  # else it is written anew
+        kept = [x for x in before if "alpha" not in x]
+        assert [x for x in lines if x in kept][: len(kept)] == kept
+        assert (
+            lines[lines.index("gamma = 1.25") - 1].lstrip().startswith(("alpha = 2.5", "R = 1.0"))
+        )
+        k = lines.index("Q = [4.0, 9.0]")
+        assert lines[k - 2 : k] == ["", "[tracking]"] or lines[k - 1] == "R = 1.0  # own"
+
+
+def test_a_study_of_a_file_with_other_line_ends_goes_on(tmp_path):
+    """A tuned mission whose lines end as those of Windows is known again as what the study wrote."""
+    mission = rf.Mission.from_toml(TEXT.replace("\n", "\r\n"))
+    first = small(mission, tmp_path / "study", validation=0)
+    data = (tmp_path / "study" / "pair-tuned.toml").read_bytes()
+    assert data == first.text.encode()
+    assert data.count(b"\n") == data.count(b"\r\n")
+    assert small(mission, tmp_path / "study", validation=0).text == first.text
+
+
+def test_digests_of_files_are_read_however_lines_end():
+    """What a mission's text tells of files that were read stays where it is written anew, and its notes are told."""
+    one, other = (f"# slots of 'a{k}.csv', SHA-256 {64 * str(k)}" for k in (1, 2))
+    text = f"{one}\n{other}. Note: no unit is said\nname = 1\n"
+    for own in (text, text.replace("\n", "\r\n")):
+        assert digest_lines(own) == text.removesuffix("name = 1\n")
+        assert notes_on_files(own) == ["slots of 'a2.csv': no unit is said"]
 
 
 # -- studies -----------------------------------------------------------------------------------------

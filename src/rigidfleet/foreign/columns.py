@@ -19,7 +19,7 @@ from rigidfleet._common.names import (
 )
 from rigidfleet._common.tables import DEFAULT, SEPARATORS, TextTable, are_axes, fault, is_number
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.math.geodesy import matrix_to_enu
+from rigidfleet.math.geodesy import turn_to_enu
 from rigidfleet.typing import Floats, Ints
 
 #: Columns of a trajectory without names, as TUM's tools for trajectories of cameras write it.
@@ -208,13 +208,16 @@ def read_tracks(
         rows = every[np.isfinite(stack(own.place, every)).all(axis=1)]
         if not len(rows):
             raise fault(f"{who!r} has no position", "Leave it out")
-        velocity, yaw = stack(own.velocity, rows) if own.velocity else None, None
+        velocity = turn_to_enu(stack(own.velocity, rows), own.axes) if own.velocity else None
+        yaw = None
         if own.yaw:
             yaw = _yaw_of_clear_unit(table, values[own.yaw[0]][rows], time[rows], rows, notes)
         elif own.quaternion:
             yaw = yaws_of(stack(own.quaternion, rows))
-        turned = _turn_to_enu(own.axes, stack(own.place, rows), velocity, yaw)
-        tracks.append(Track(who, table.lines[rows], time[rows], *turned))
+        if yaw is not None and own.axes != "enu":  # whose whole turns count
+            yaw = _yaw_in_enu(yaw, own.axes)
+        place = turn_to_enu(stack(own.place, rows), own.axes)
+        tracks.append(Track(who, table.lines[rows], time[rows], place, velocity, yaw))
     named = table.kinds[main.place[0]].kind in DIRECTIONS
     said = "the option" if axes else "the file" if named else ""
     notes += _doubts_about_units(table, tracks, axes=bool(said))
@@ -386,17 +389,10 @@ def yaws_of(quaternions: Floats) -> Floats:
     return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
-def _turn_to_enu(
-    axes: str, place: Any, velocity: Floats | None, yaw: Floats | None
-) -> tuple[Floats, Floats | None, Floats | None]:
-    """Places, velocities (K, 3) and yaws (K,) in east, north, up; yaw turns from the first axis to the second."""
-    if axes == "enu":
-        return place, velocity, yaw
-    turn = matrix_to_enu(axes)
-    if yaw is not None:
-        x, y, up = turn[:, :2] @ np.stack([np.cos(yaw), np.sin(yaw)])
-        yaw = None if up.any() else np.arctan2(y, x)
-    return place @ turn.T, None if velocity is None else velocity @ turn.T, yaw
+def _yaw_in_enu(yaw: Floats, axes: str) -> Floats | None:
+    """Yaws (K,) from east to north, of those from the first axis to the second; None if these do not lie flat."""
+    x, y, up = turn_to_enu(np.stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw], axis=1), axes).T
+    return None if up.any() else np.arctan2(y, x)
 
 
 def _yaw_of_clear_unit(
@@ -424,13 +420,18 @@ def _yaw_of_clear_unit(
     return yaw
 
 
+def doubt_about_heights(height: Floats) -> str:
+    """That heights (K,) [m] of which nobody says whether they count upwards look as if they did not; else ""."""
+    if height.max() > 0.1 or height.min() >= -0.5:
+        return ""
+    return f"all heights are at or below 0, down to {height.min():.4g} m: does z point down?"
+
+
 def _doubts_about_units(table: TextTable, tracks: list[Track], *, axes: bool) -> Iterator[str]:
     """What is assumed of units, and what looks as if it had other units or axes."""
     place = np.concatenate([track.place for track in tracks])
-    top, bottom = place[:, 2].max(), place[:, 2].min()
-    if not axes and top <= 0.1 and bottom < -0.5:
-        why = f"all heights are at or below 0, down to {bottom:.4g} m"
-        yield Doubt(f"{why}: does z point down? Say --axes ned or enu")
+    if not axes and (why := doubt_about_heights(place[:, 2])):
+        yield Doubt(f"{why} Say --axes ned or enu")
     things = {"time": "times", "length": "places"}
     things |= {"angle": "yaws"} if any(track.yaw is not None for track in tracks) else {}
     assumed = [

@@ -38,17 +38,10 @@ _CAPTURE = (
     "is an export of {}, with names of bodies above x, y and z: give one line of names such as time_s,cf1_x_mm,"
     "cf1_y_mm,cf1_z_mm,cf2_x_mm above the rows, and say --axes eus if y points up"
 )
-#: What is not read, by its first bytes, and what to do with it.
+#: What is not read, by its first bytes (a line may end in any way), and what to do with it.
 _REFUSED = {
     b"Format Version,": _CAPTURE.format("Motive"),
-    **dict.fromkeys(
-        [
-            f"{word}{end}".encode()
-            for word in ("Objects", "Segments", "Trajectories")
-            for end in "\r\n"
-        ],
-        _CAPTURE.format("Vicon"),
-    ),
+    **dict.fromkeys((b"Objects\n", b"Segments\n", b"Trajectories\n"), _CAPTURE.format("Vicon")),
     b"\x89HDF": "is HDF5. Give a result of `rigidfleet run` alone, and any other data as CSV",
     b"#ROSBAG": "is of ROS 1. Convert it: pip install rosbags; rosbags-convert --src {} --dst FOLDER",
     b"\x1f\x8b": "is compressed. Unpack it: gunzip {}",
@@ -341,7 +334,7 @@ def _read_file(
     path = parts[0]
     head, suffix, log = _first_bytes_of(path), path.suffix.lower(), None
     for begin, why in _REFUSED.items():
-        if head.startswith(begin):
+        if head.replace(b"\r", b"\n").startswith(begin):
             raise TrajectoryError(f"{path}: {why.format(path.name)}.")
     try:
         if head.startswith((poses.MCAP, poses.SQLITE)) or suffix in _RECORDINGS:

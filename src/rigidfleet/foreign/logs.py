@@ -12,6 +12,7 @@ from __future__ import annotations
 import io
 import math
 import re
+import struct
 from array import array
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
@@ -26,8 +27,9 @@ import numpy as np
 
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet._common.text import first_few
+from rigidfleet.foreign.columns import doubt_about_heights
 from rigidfleet.foreign.curves import ASSUMED, LoggedStates, Trajectories, curve_through_samples
-from rigidfleet.math.geodesy import Geodetic, enu_of
+from rigidfleet.math.geodesy import Geodetic, enu_of, turn_to_enu
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats, Ints
 
@@ -50,6 +52,8 @@ ULOG, BIN = b"ULog\x01\x12\x35", b"\xa3\x95"
 #: Bytes before the first message of a ULog, and the kinds of its messages (PX4's guide: ULog file format).
 _ULOG_HEAD, _ULOG_KINDS = 16, frozenset(b"BFIMPQARDLCSO")
 DAMAGED = "the log is damaged in part: what could be read is judged"
+CUT = "the log ends in the middle of a message: it is judged up to there"
+_ELLIPSOID = "heights are above the ellipsoid, that of the origin is above mean sea level: up to 100 m beside it"
 GNSS = "that of the receiver of GNSS, true to its delay of some tenths of a second"
 
 
@@ -101,14 +105,18 @@ FORMS: dict[str, list[_Fields]] = {name: forms for *forms, names in (
 ) for name in names.split()}  # fmt: skip
 #: What else of logs of ArduPilot and MAVLink is read, by message, and fields by which a vehicle is armed.
 _BESIDE = {
-    "ORGN": "Lat Lng Alt Type", "XKV1": _VARIANCES, "NKV1": _VARIANCES, "XKF4": "PI", "NKF4": "PI", "ARM": "ArmState",
-    "GPS_GLOBAL_ORIGIN": "latitude longitude altitude", "HEARTBEAT": "base_mode autopilot", "BAD_DATA": "",
+    "ORGN": "Lat Lng Alt Type", "XKV1": _VARIANCES, "NKV1": _VARIANCES, "ARM": "ArmState",
+    "XKF4": "PI SS", "NKF4": "PI SS", "GPS_GLOBAL_ORIGIN": "latitude longitude altitude",
+    "HEARTBEAT": "base_mode autopilot", "BAD_DATA": "",
 }  # fmt: skip
 #: What fields are at least where a place is valid (a fix of GNSS in three dimensions is 3), and those that count how
 #: often an estimator set it anew.
 _VALID = dict.fromkeys(("xy_valid", "z_valid", "lat_lon_valid", "alt_valid", "is_ned"), 1)
-_VALID |= {"fix_type": 3, "Status": 3}
+_VALID |= {"fix_type": 3, "Status": 3, "has_place": 1}
 _RESETS = [f"{name}reset_counter" for name in ("xy_", "z_", "lat_lon_", "alt_", "")]
+#: Bits of the status of ArduPilot's filter (`AP_Nav_Common.h`): its place is known from its start, or on the Earth; its
+#: height is. Without them it writes where it was, or what a receiver says.
+_HORIZONTAL, _VERTICAL = 0b11000, 0b100000
 #: What MAVLink writes for a heading that is not known [0.01 deg], and who is no autopilot.
 _UNKNOWN, _NO_AUTOPILOT = 65535, 8
 #: Frames of the Earth of MAVLink's `MAV_FRAME`: local ones that are turned anyhow are not read.
@@ -228,7 +236,7 @@ def trajectories_of(
         A vehicle has no valid position.
     """
     tracks: dict[str, _Track] = {}
-    notes = {note: [""] for note in log.notes}
+    notes, above = {note: [""] for note in log.notes}, origin is not None
     several |= len(log.vehicles) > 1
     for who in sorted(log.vehicles, key=natural_sort_key):
         reasons, read = list[str](), list[tuple[Channel, _Track]]()
@@ -252,7 +260,8 @@ def trajectories_of(
         words = f"positions are those of {channel.topic}"
         if others := [c.topic for c in channels if c is not channel and not topics][:_LISTED]:
             words += f"; --topic may name {', '.join(others)}"
-        for note in (*[words] * (who != channel.topic), *reasons[:1], *track.notes):
+        other = [_ELLIPSOID] * (above and channel.message == "NavSatFix")
+        for note in (*[words] * (who != channel.topic), *reasons[:1], *track.notes, *other):
             notes.setdefault(note, []).append(who)
         tracks[who or stem], origin = track, origin or track.origin
     every = tracks.values()
@@ -333,11 +342,13 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
         It has no valid one.
     """
     columns, notes, reference = channel.columns, [], channel.reference
-    forms = FORMS[channel.message]
-    form = next((f for f in forms if {*f.place.split()} <= columns.keys()), None)
+    form = next((f for f in FORMS[channel.message] if {*f.place.split()} <= columns.keys()), None)
     if form is None:
         raise fault(f"{channel.topic}: its messages are of a form that is not known")
-    frame = next((f for f in ("ned", "enu") if channel.frame.endswith(f"_{f}")), form.frame)
+    # The last word of the name of a frame says its axes, those of places on the Earth but where their receiver is.
+    named = re.split(r"[^A-Za-z]|(?<=[a-z])(?=[A-Z])", channel.frame)[-1].lower()
+    assumed = form.frame == "geodetic" or named not in ("ned", "enu")
+    frame = form.frame if assumed else named
     place = _stack_columns(columns, form.place) * form.units[:3]
     known = np.asarray(np.abs(place) < FAR).all(axis=1)
     known &= (place[:, :2] != 0.0).any(axis=1) | (frame != "geodetic")
@@ -356,24 +367,27 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     if "received" in own:  # as if the quickest message came at once
         late = own["received"] - time
         time = time + late[late > np.median(late) - _EARLY].min()
+    axes = "enu" if frame == "enu" else "ned"
     if frame == "geodetic":
         if origin is None:
             notes.append("positions are about the first one: no origin is stated")
         origin = origin or (*place[0].tolist(),)
         place = enu_of(place, origin)
     else:
-        place = _turn_to_enu(place, frame)
+        if frame == "enu" and assumed and (words := doubt_about_heights(place[:, 2])):
+            notes.append(f"{words} The name of its frame, {channel.frame!r}, would end in _ned")
+        place = turn_to_enu(place, axes)
         if reference is not None:
             origin = origin or (*reference[-1].tolist(),)
             place = place + enu_of(reference[rows], origin)
         elif frame == "ned":
             notes.append("positions are about a place that the log does not tell")
     if form.velocity and {*form.velocity.split()} <= own.keys():
-        velocity = _turn_to_enu(_stack_columns(own, form.velocity) * form.units[3], frame)
+        velocity = turn_to_enu(_stack_columns(own, form.velocity) * form.units[3], axes)
     if form.spread and {*form.spread.split()} <= own.keys():
         spread = np.maximum(_stack_columns(own, form.spread), 0.0)
         spread = spread * _SHARES if form.spread == _EPH else np.sqrt(spread)
-        deviation = np.abs(_turn_to_enu(np.where(spread > 0.0, spread, np.nan), frame))
+        deviation = np.abs(turn_to_enu(np.where(spread > 0.0, spread, np.nan), axes))
     for name in {*form.yaw.split()} & own.keys():
         yaw = own[name].astype(np.float64) * form.units[4]
         yaw = yaw if frame == "enu" else 0.5 * np.pi - yaw
@@ -395,15 +409,6 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
 
 def _stack_columns(columns: dict[str, Any], names: str) -> Floats:
     return np.column_stack([columns[name] for name in names.split()]).astype(np.float64)
-
-
-def swap_enu_and_ned(x: Floats) -> Floats:
-    """Vectors (..., 3) in east, north, up from north, east, down, or back."""
-    return x[..., [1, 0, 2]] * [1.0, 1.0, -1.0]
-
-
-def _turn_to_enu(x: Floats, frame: str) -> Floats:
-    return x if frame == "enu" else swap_enu_and_ned(x)
 
 
 def _increasing_rows(time: Any, rows: Ints, notes: list[str]) -> Ints:
@@ -431,16 +436,23 @@ def _resets(columns: dict[str, Any], time: Floats, place: Floats, velocity: Floa
     return np.flatnonzero(far > max(_JUMP, _UNUSUAL * float(np.median(far)))) + 1
 
 
-def _origins_at(time: Ints, stated: dict[str, Any], names: str, units: Any = 1.0) -> Floats | None:
-    """Where the origin was by what was stated last (K, 3), at first by the first statement; None without any."""
+def _origins_at(order: Any, stated: dict[str, Any], names: str, units: Any = 1.0) -> Floats | None:
+    """Where the origin was by what was stated last (K, 3), at first by the first statement; None without any.
+
+    ``order`` (K,) increases from message to message, as that of the statements does: clocks may begin anew.
+    """
     if not {*names.split()} <= stated.keys():
         return None
     place = _stack_columns(stated, names) * units
     known = np.isfinite(place).all(axis=1) & (place[:, :2] != 0.0).any(axis=1)
     if not known.any():
         return None
-    k = np.searchsorted(stated["time"][known], time, side="right") - 1
-    return place[known][np.maximum(k, 0)]
+    return _latest(order, stated["order"][known], place[known])
+
+
+def _latest(order: Any, stated: Any, values: Any) -> Any:
+    """Of values that were stated in order the last ones at some places in it; at first the first."""
+    return values[np.maximum(np.searchsorted(stated, order, side="right") - 1, 0)]
 
 
 def _read_ulog(path: Path) -> Log:
@@ -459,7 +471,8 @@ def _read_ulog(path: Path) -> Log:
         channels.append(channel_of_px4(topic, x.name, x.data, after))
         if x.name == "actuator_armed":
             armed = channels.pop().columns["time"], x.data["armed"]
-    notes = [DAMAGED] * (log.file_corruption or _has_unknown_message(path))
+    unknown, cut = _unknown_and_cut_messages(path)
+    notes = [DAMAGED] * (log.file_corruption or unknown) + [CUT] * cut
     if lost := [x.duration / 1e3 for x in log.dropouts]:
         words = f"{sum(lost):.3g} s in all, at most {max(lost):.3g} s"
         notes.append(f"the logger lost data {len(lost):,} times, {words}")
@@ -467,15 +480,23 @@ def _read_ulog(path: Path) -> Log:
     return Log({"": channels}, clock, armed, tuple(notes))
 
 
-def _has_unknown_message(path: Path) -> bool:
-    """Whether a ULog has a message of no known kind, where pyulog may stop as at the end of a log."""
+def _unknown_and_cut_messages(path: Path) -> tuple[bool, bool]:
+    """Whether a ULog has a message of no known kind, where pyulog may stop as at the end of a log, and one that is cut.
+
+    What was appended to a log begins where its flags say, whether or not the message before had ended.
+    """
     with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
-        at = _ULOG_HEAD
-        while at + 3 <= len(data):
-            if data[at + 2] not in _ULOG_KINDS:
-                return True
-            at += 3 + int.from_bytes(data[at : at + 2], "little")
-    return False
+        at, cut, appended = _ULOG_HEAD, False, ()
+        if data[at + 2 : at + 12 : 9] == b"B\1":
+            appended = struct.unpack_from("<3Q", data, at + 19)
+        for end in (*filter(None, appended), len(data)):
+            while at + 3 <= min(end, len(data)):
+                if data[at + 2] not in _ULOG_KINDS:
+                    return True, cut
+                at += 3 + int.from_bytes(data[at : at + 2], "little")
+            cut |= at != end
+            at = end
+    return False, cut
 
 
 def channel_of_px4(topic: str, message: str, data: dict[str, Any], after: int = 0) -> Channel:
@@ -486,20 +507,22 @@ def channel_of_px4(topic: str, message: str, data: dict[str, Any], after: int = 
     for field, ned in (("pose_frame", 1), ("local_frame", 0)):
         if field in data:
             data["is_ned"] = data[field] == ned
-    origins = _origins_at(data["time"], data, "ref_lat ref_lon ref_alt")
+    data["order"] = np.arange(len(stamp))
+    origins = _origins_at(data["order"], data, "ref_lat ref_lon ref_alt")
     return Channel(topic, message, data, "", origins)
 
 
 def _collect_columns(log: Any) -> dict[tuple[int, str, int], dict[str, Any]]:
     """Columns of the messages of a log that matter, by system, message and lane: a core, or a component of a system.
 
-    ``time`` is that of the vehicle [ns], ``received`` when the message came to who wrote the log.
+    ``time`` is that of the vehicle [ns], ``received`` when the message came to who wrote the log, ``order`` its number.
     """
     names = {name: own.split() for name, own in _BESIDE.items()}
     for name, ((_, *own, _), *_) in FORMS.items():
         names[name] = [*" ".join(own).split(), "frame_id", *_RESETS, *_VALID]
     rows: dict[tuple[int, str, int], array[float]] = defaultdict(lambda: array("d"))
-    while (message := log.recv_match(type=[*names])) is not None:
+    messages = iter(lambda: log.recv_match(type=[*names]), None)
+    for number, message in enumerate(messages):
         kind, received = message.get_type(), message._timestamp
         who, lane = 0, getattr(message, "C", getattr(message, "I", 0))
         if hasattr(message, "get_srcSystem"):
@@ -507,15 +530,16 @@ def _collect_columns(log: Any) -> dict[tuple[int, str, int], dict[str, Any]]:
         stamp = getattr(message, "time_usec", 0.0) / 1e6 or received
         stamp = getattr(message, "time_boot_ms", 1e3 * stamp) / 1e3
         own = (_number_of(message, *name.split("[")) for name in names[kind])
-        rows[who, kind, 0 if kind in _BESIDE else lane].extend((stamp, received, *own))
+        laned = kind in FORMS or kind[1:] == "KF4"
+        rows[who, kind, lane if laned else 0].extend((number, stamp, received, *own))
     table = {}
     for key, numbers in rows.items():
-        own = np.frombuffer(numbers).reshape(-1, 2 + len(names[key[1]])).T
-        columns = zip(names[key[1]], own[2:], strict=True)
+        own = np.frombuffer(numbers).reshape(-1, 3 + len(names[key[1]])).T
+        columns = zip(names[key[1]], own[3:], strict=True)
         table[key] = {k: x for k, x in columns if np.isfinite(x).any()}
         with np.errstate(invalid="ignore"):  # what is no message has any time
-            stamps = np.round(1e9 * own[:2]).astype(np.int64)
-        table[key] |= {"time": stamps[0], "received": stamps[1]}
+            stamps = np.round(1e9 * own[1:3]).astype(np.int64)
+        table[key] |= {"order": own[0], "time": stamps[0], "received": stamps[1]}
     return table
 
 
@@ -537,8 +561,12 @@ def _read_bin(path: Path) -> Log:
 
     with closing(Reader(str(path))) as log:
         table = _collect_columns(log)
-        last = max(int(own[-1]) for own in log.offsets if len(own))
+        last, kind = max((int(own[-1]), k) for k, own in enumerate(log.offsets) if len(own))
         notes = (DAMAGED,) if log.data_len - last > _PAGES else ()
+        end = last + (log.formats[kind].len if kind in log.formats else _PAGES)
+        rest = log.data_map[end : end + len(BIN)]
+        if end > log.data_len or (rest and BIN.startswith(rest)):
+            notes += (CUT,)
     beside = {kind: columns for (_, kind, _), columns in table.items() if kind in _BESIDE}
     channels, dated, origin = [], False, beside.get("ORGN", {})
     if origin:  # type 0 is the origin of the filter
@@ -546,17 +574,21 @@ def _read_bin(path: Path) -> Log:
     for (_, kind, lane), columns in table.items():
         if kind in _BESIDE:
             continue
-        dated, own = bool(columns["time"][0] > _DATES), beside.get(f"{kind[0]}KF4")
+        # What the same core says of itself; other messages have no such.
+        dated, own = bool(columns["time"][0] > _DATES), table.get((0, f"{kind[0]}KF4", lane), {})
         del columns["received"]
-        main = lane == (int(np.median(own["PI"])) if own and kind[1:] == "KF1" else 0)
-        if main and own and kind[1:] == "KF1" and (share := float(np.mean(own["PI"] != lane))):
+        main = lane == (int(np.median(own["PI"])) if own else 0)
+        if "SS" in own:
+            status = _latest(columns["order"], own["order"], own["SS"]).astype(int)
+            columns["has_place"] = (status & _HORIZONTAL > 0) & (status & _VERTICAL > 0)
+        if main and own and (share := float(np.mean(own["PI"] != lane))):
             notes += (
                 f"in {100 * share:.2g} % of the log, the estimator trusted another core than {kind}:{lane}",
             )
-        if main and kind[1:] == "KF1" and (own := beside.get(f"{kind[0]}KV1")):
+        if main and (own := beside.get(f"{kind[0]}KV1")):
             at = columns["time"], own["time"]
             columns |= {name: np.interp(*at, own[name]) for name in _VARIANCES.split()}
-        place = _origins_at(columns["time"], origin, "Lat Lng Alt")
+        place = _origins_at(columns["order"], origin, "Lat Lng Alt")
         made = Channel(f"{kind}:{lane}" if lane else kind, kind, columns, "", place)
         channels.insert(0 if main else len(channels), made)
     armed = (own["time"], own["ArmState"]) if (own := beside.get("ARM")) else None
@@ -572,15 +604,13 @@ def _read_tlog(path: Path) -> Log:
 
     with closing(mavlogfile(str(path))) as log:
         table = _collect_columns(log)
+        cut = log.mav.buf_len() > 0
     vehicles: dict[int, list[Channel]] = defaultdict(list)
     for (who, kind, lane), columns in sorted(table.items(), key=lambda each: each[0][2]):
         if kind not in _BESIDE:
-            own = table.get((who, "GPS_GLOBAL_ORIGIN", 0), {})
-            # The vehicle does not stamp it: it counts from when it came.
-            own, frame = own | {"time": own.get("received")}, ""
-            place = _origins_at(
-                columns["received"], own, _BESIDE["GPS_GLOBAL_ORIGIN"], _INTEGERS[:3]
-            )
+            kept, frame = "GPS_GLOBAL_ORIGIN", ""
+            own = table.get((who, kept, 0), {})
+            place = _origins_at(columns["order"], own, _BESIDE[kept], _INTEGERS[:3])
             if "frame_id" in columns:
                 frame = _FRAMES.get(int(columns["frame_id"][0]), "")
                 columns["is_ned"] = (columns["frame_id"] == columns["frame_id"][0]) & bool(frame)
@@ -588,7 +618,8 @@ def _read_tlog(path: Path) -> Log:
             first = all(kind != other.message for other in vehicles[who])
             name = kind if first else f"{kind}:{lane}"
             vehicles[who].append(Channel(name, kind, columns, frame, place))
-    armed, notes = None, (DAMAGED,) if any(kind == "BAD_DATA" for _, kind, _ in table) else ()
+    armed, damaged = None, any(kind == "BAD_DATA" for _, kind, _ in table)
+    notes = *[DAMAGED] * damaged, *[CUT] * cut
     named = {f"system {who}": channels for who, channels in vehicles.items()}
     if len(vehicles) < 2:
         ((who, channels),) = vehicles.items() or [(0, [])]

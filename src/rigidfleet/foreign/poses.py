@@ -21,7 +21,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
@@ -42,6 +42,10 @@ from rigidfleet.foreign.logs import (
 #: How recordings begin, and what Zstandard packed.
 MCAP, SQLITE, ZSTANDARD = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 _BILLION = 1_000_000_000
+#: Orders of bytes of plain CDR, by its first bytes; and a field of a message that has numbers alone, all of one size.
+_Order = Literal["<", ">"]
+_ORDERS: dict[bytes, _Order] = {b"\0\0": ">", b"\0\1": "<"}
+_FIELD = re.compile(r"\s*(bool|byte|u?int\d+|float\d+)(?:\[(\d+)\])?\s+(\w+)(?:\s.*)?")
 #: Frames of REP 105 in which robots move, perhaps each in its own; that of odometry moves in the map itself. And words
 #: for places that a robot is to reach.
 _NO_VEHICLE = re.compile(rf":(.*[/_])?(map|odom)$|(?<![a-z])({'|'.join(sorted(WANTED))})(?![a-z])")
@@ -50,19 +54,13 @@ _CAPITAL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 #: Greatest size of a chunk of a recording when it is unpacked, and of a message [bytes].
 _CHUNK, _MESSAGE = 32 << 20, 1 << 20
 #: Numbers of a message after its names: a position and a quaternion (7), the covariance of a pose (36, by rows), and a
-#: velocity in the vehicle's axes (3); or latitude, longitude [deg] and height [m] (3).
+#: velocity in the vehicle's axes (3); or latitude, longitude [deg] and height [m] (3). And the package that it is of:
+#: others may have messages of these names, with other fields.
 _NUMBERS = {
-    "PoseStamped": 7, "PoseWithCovarianceStamped": 43, "Odometry": 46, "TransformStamped": 7, "TFMessage": 7,
-    "NamedPoseArray": 7, "NavSatFix": 3,
+    "PoseStamped": (7, "geometry_msgs"), "PoseWithCovarianceStamped": (43, "geometry_msgs"),
+    "Odometry": (46, "nav_msgs"), "TransformStamped": (7, "geometry_msgs"), "TFMessage": (7, "tf2_msgs"),
+    "NamedPoseArray": (7, "motion_capture_tracking_interfaces"), "NavSatFix": (3, "sensor_msgs"),
 }  # fmt: skip
-#: Packages whose messages these are; others may have messages of these names, with other fields.
-_PACKAGES = (
-    "geometry_msgs",
-    "nav_msgs",
-    "sensor_msgs",
-    "tf2_msgs",
-    "motion_capture_tracking_interfaces",
-)
 
 
 #: Topic and body, how their `_Rows` begin, stamp and time of recording [ns], and numbers of a position.
@@ -106,9 +104,10 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
             topic, first, stamp, received, numbers = each
             own = rows.setdefault(topic, _Rows(*first, array("q"), array("q"), array("d")))
             if first[2] and not own.frame:
+                unread |= {f"{topic} in ''": f"is in {first[2]!r} later"} if any(own.stamps) else {}
                 own = rows[topic] = _Rows(*first, array("q"), array("q"), array("d"))
-            if own.frame != first[2]:
-                unread[f"{topic} in {first[2]!r}"] = f"is in {own.frame!r} first"
+            if first != own[:3]:
+                unread[f"{topic} in {first[2]!r}"] = f"is {own.message} in {own.frame!r} first"
                 continue
             own.stamps.append(stamp)
             own.received.append(received)
@@ -169,7 +168,7 @@ def _read_positions(path: Path, unread: dict[str, str]) -> Iterator[_Place]:
             unread[topic] = _PATH
         elif own and kind in FORMS and not definition:
             unread[topic] = _UNDEFINED
-        elif kind in _NUMBERS and package not in _PACKAGES:
+        elif kind in _NUMBERS and package != _NUMBERS[kind][1]:
             unread[topic] = f"has messages of {name}, whose fields are not known"
         elif kind in (FORMS if own else _NUMBERS) and topic != "/tf_static":
             if code != "cdr":
@@ -178,7 +177,12 @@ def _read_positions(path: Path, unread: dict[str, str]) -> Iterator[_Place]:
                 from zstandard import ZstdDecompressor
 
                 data = ZstdDecompressor().decompress(data, _MESSAGE)  # noqa: PLW2901
-            layout = _message_layout(definition, data[1:2] == b"\1") if own else None
+            if data[:2] not in _ORDERS:
+                raise fault(f"{topic}: is encoded in CDR {data[:2].hex()}, not in plain CDR")
+            layout = _message_layout(definition, _ORDERS[data[:2]]) if own else None
+            if own and layout is None:
+                unread[topic] = f"has messages of {name} whose definition is not understood"
+                continue
             count[topic] += 1
             try:
                 for who, frame, stamp, numbers in _stamped_positions(kind, layout, data):
@@ -228,12 +232,17 @@ def _records_of_mcap(path: Path) -> Iterator[tuple[str, str, str, str, bytes, in
 
 
 @lru_cache(100)
-def _message_layout(definition: str, little: bool) -> np.dtype[Any]:
-    """Where the fields of a message are after its first 4 bytes, if all have one size: kept for the next ones."""
+def _message_layout(definition: str, order: _Order) -> np.dtype[Any] | None:
+    """Where the fields of a message are after its first 4 bytes; None unless each is understood, and has one size."""
     fields, at = dict[str, tuple[np.dtype[Any], int]](), 0
-    line = r"(?m)^[ \t]*(\w+)(?:\[(\d+)\])?[ \t]+(\w+)[ \t]*(?:#.*)?$"
-    for kind, count, name in re.findall(line, definition.partition("\n===")[0]):
-        own = np.dtype(kind).newbyteorder("<" if little else ">")
+    for line in definition.partition("\n===")[0].splitlines():
+        text = line.partition("#")[0]
+        if not text.strip() or re.match(r"\s*\w+\s+\w+\s*=", text):  # no message has a constant
+            continue
+        if (field := _FIELD.fullmatch(text)) is None:
+            return None
+        kind, count, name = field.groups()
+        own = np.dtype(kind).newbyteorder(order)
         at += -at % own.itemsize
         for k in range(int(count or 1)):
             fields[f"{name}[{k}]" if count else name] = own, at
@@ -251,7 +260,7 @@ def _stamped_positions(
             raise struct.error
         yield "", "", 0, np.frombuffer(message, layout, 1, 4).item()
         return
-    order, at = "<" if message[1:2] == b"\1" else ">", 4
+    order, at = _ORDERS[message[:2]], 4
 
     def read(form: str) -> tuple[Any, ...]:
         """Numbers of one size, from their place on."""
@@ -278,7 +287,7 @@ def _stamped_positions(
             yield "", frame, stamp, read("3d") if fixed else (math.nan,) * 3
             return
         who = f":{next_text()}" if kind in ("TransformStamped", "TFMessage", "Odometry") else ""
-        yield who if kind != "Odometry" else "", frame, stamp, read(f"{_NUMBERS[kind]}d")
+        yield who if kind != "Odometry" else "", frame, stamp, read(f"{_NUMBERS[kind][0]}d")
 
 
 def _channel_of_rows(topic: str, rows: _Rows) -> Channel:

@@ -15,7 +15,7 @@ from rigidfleet._common.names import meaning_of
 from rigidfleet._common.tables import ContentError, Fault, TextTable, fault, notes_on_units
 from rigidfleet._common.text import first_few
 from rigidfleet.errors import Finding, MissionError
-from rigidfleet.math.geodesy import matrix_to_enu
+from rigidfleet.math.geodesy import turn_to_enu
 from rigidfleet.typing import Floats, Ints
 
 #: Greatest size of a file of points [bytes], and number of wrong lines that are named one by one.
@@ -190,7 +190,7 @@ def _read_point_table(data: bytes) -> tuple[Ints, Floats, Colours, Notes]:
     values = table.numbers_of_columns(columns + hues)
     if table.decimal == "," and not table.named:
         notes.append("commas are read as decimal marks")
-    points, colours = values[:, :n] @ matrix_to_enu(axes)[:, :n].T, None
+    points, colours = turn_to_enu(np.pad(values[:, :n], ((0, 0), (0, 3 - n))), axes), None
     known = {*columns, *hues, *written, *time}
     unread = [repr(name) for k, name in enumerate(table.names) if name and k not in known
               and table.kinds[k].kind not in ("agent", "thing")]  # fmt: skip

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.foreign.curves import curve_through_states
-from rigidfleet.foreign.logs import swap_enu_and_ned
 from rigidfleet.interchange.curves import ExportedMotion
+from rigidfleet.math.geodesy import turn_to_enu
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.setpoints import setpoints_at
 from rigidfleet.typing import Ints
@@ -55,7 +55,7 @@ def write_tlog_of_each_vehicle(motion: ExportedMotion, rate: float | None) -> It
         milliseconds = every[flies]
         fields: Any = np.zeros(len(milliseconds), dtype=_FIELDS)
         fields["time_boot_ms"] = milliseconds
-        fields["state"] = swap_enu_and_ned(setpoints.state[flies, :3, 0])
+        fields["state"] = turn_to_enu(setpoints.state[flies, :3, 0], "ned")
         fields["yaw"] = (np.pi / 2 - setpoints.yaw[flies, 0] + np.pi) % (2.0 * np.pi) - np.pi
         fields["yaw_rate"] = -setpoints.yaw_rate[flies, 0]
         fields["target_system"], fields["target_component"] = system, _AUTOPILOT
@@ -74,7 +74,7 @@ def read_tlog(data: bytes) -> list[Piecewise]:
     kind = np.dtype([*_HEAD, ("fields", _FIELDS), *_CHECKSUM])
     records: Any = np.frombuffer(data, kind, len(data) // kind.itemsize)
     fields = records["fields"]
-    state = swap_enu_and_ned(fields["state"].astype(float)).swapaxes(0, 1)
+    state = turn_to_enu(fields["state"], "ned").swapaxes(0, 1)
     north, rate = fields["yaw"].astype(float), fields["yaw_rate"].astype(float)
     yaw = np.stack([np.unwrap(np.pi / 2 - north), -rate])
     return [curve_through_states(fields["time_boot_ms"] / 1e3, state[:2], yaw)]

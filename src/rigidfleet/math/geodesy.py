@@ -14,12 +14,13 @@ Geodetic = tuple[float, float, float]
 _RADIUS, _ECCENTRICITY = 6_378_137.0, 6.694_379_990_14e-3
 
 
-def matrix_to_enu(axes: str) -> Floats:
-    """The matrix (3, 3) from places along three directions, such as "ned", to east, north, up."""
-    turn = np.zeros((3, 3))
-    for k, letter in enumerate(axes):
-        turn[AXES[letter][0], k] = AXES[letter][1]
-    return turn
+def turn_to_enu(vectors: ArrayLike, axes: str) -> Floats:
+    """Vectors (..., 3) along three directions, such as "ned", in east, north, up.
+
+    What is not finite along one axis stays there. From "ned" and back is the same.
+    """
+    along, signs = zip(*(AXES[letter] for letter in axes), strict=True)
+    return np.multiply(vectors, signs)[..., np.argsort(along)]
 
 
 def enu_of(geodetic: ArrayLike, origin: Geodetic) -> Floats:

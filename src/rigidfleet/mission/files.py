@@ -83,13 +83,15 @@ def inline_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str,
 
 def digest_lines(text: str) -> str:
     """The lines of a mission's text that tell the digests of files, for a text that is written anew from its data."""
-    lines = re.findall(rf"^# .*{_DIGEST}[0-9a-f]{{64}}(?:{_DOUBTS}.*)?$", text, re.MULTILINE)
+    digest = rf"# .*{_DIGEST}[0-9a-f]{{64}}(?:{_DOUBTS}.*)?"
+    lines = (line for line in text.splitlines() if re.fullmatch(digest, line))
     return "".join(f"{line}\n" for line in dict.fromkeys(lines))
 
 
 def notes_on_files(text: str) -> list[str]:
     """What is said of the files of a mission's text, each with what was read of it."""
-    lines = re.findall(rf"^[ \t]*# (.*), {_DIGEST}[0-9a-f]{{64}}{_DOUBTS}(.*)$", text, re.MULTILINE)
+    noted = rf"^[ \t]*# (.*), {_DIGEST}[0-9a-f]{{64}}{_DOUBTS}(.*)$"
+    lines = re.findall(noted, "\n".join(text.splitlines()), re.MULTILINE)
     return [f"{what}: {notes}" for what, notes in dict.fromkeys(lines)]
 
 

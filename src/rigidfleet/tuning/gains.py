@@ -188,21 +188,26 @@ def feasible_points(
 
 def with_gains(text: str, gains: Gains) -> str:
     """The text of a mission with other gains; the rest, comments included, stays where the text allows it."""
-    wanted, new = tomllib.loads(text), text
+    end = "\r\n" if text.count("\r\n") == text.count("\n") > 0 else "\n"
+    wanted, new = tomllib.loads(text), text.replace(end, "\n")
     whole = {"tracking": {"Q": [*Tracking.model_fields["Q"].get_default()]}}
     for path, gain in gains.items():
         table, key, *place = path.split(".")
         keys = (table, key, *(int(k) - 1 for k in place))
         replace_value(wanted, whole, keys, lambda _, gain=gain: gain)
         new = _replace_line(new, table, key, to_toml({key: wanted[table][key]}).strip())
-    return new if toml_equals_data(new, wanted) else digest_lines(text) + to_toml(wanted)
+    new = new if toml_equals_data(new, wanted) else digest_lines(text) + to_toml(wanted)
+    return new.replace("\n", end)
 
 
 def _replace_line(text: str, table: str, key: str, line: str) -> str:
-    """The text with ``line`` in place of a key's, or below the table's header, or in a new table at the end."""
-    head = rf"(?m)(^[ \t]*\[\s*{table}\s*\].*\n)"
-    entry = rf"((?:(?!\s*\[).*\n)*?)[ \t]*{key}\s*=[^#\n]*?([ \t]*#.*)?$"
-    new, changed = re.subn(head + entry, lambda m: f"{m[1]}{m[2]}{line}{m[3] or ''}", text, count=1)
-    if not changed:
-        new, changed = re.subn(head, lambda m: f"{m[1]}{line}\n", text, count=1)
-    return new if changed else f"{text}\n[{table}]\n{line}\n"
+    """The text with ``line`` in place of a key's, or below the last key of its table, or in a new table at the end."""
+    text = text if text.endswith("\n") else f"{text}\n"
+    lines = re.search(rf"(?m)^[ \t]*\[\s*{table}\s*\].*(?:\n(?!\s*\[).*)*", text)
+    if lines is None:
+        return f"{text}\n[{table}]\n{line}\n"
+    entry = rf"(?m)^([ \t]*){key}\s*=[^#\n]*?([ \t\r]*(?:#.*)?)$"
+    new, changed = re.subn(entry, lambda m: f"{m[1]}{line}{m[2]}", lines[0], count=1)
+    if not changed:  # below the last line that is no comment
+        new = re.sub(r"\A(?s:.*\n)?[ \t]*[^#\s].*", lambda m: f"{m[0]}\n{line}", new, count=1)
+    return text[: lines.start()] + new + text[lines.end() :]

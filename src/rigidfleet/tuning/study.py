@@ -349,7 +349,7 @@ class _Claim:
                 f"{self.folder}: contains another study; it differs in: {', '.join(other)}. Use --force to overwrite,"
                 " or --out to choose another folder."
             )
-        elif self.tuned.exists() and self.tuned.read_text("utf-8") != before.get("text"):
+        elif self.tuned.exists() and self.tuned.read_bytes() != before.get("text", "").encode():
             raise ResultError(
                 f"{self.tuned}: is not what a study wrote; use --force to overwrite or --out to choose another place."
             )
