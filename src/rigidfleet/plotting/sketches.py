@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from rigidfleet.mission import Mission
+
+#: Greatest length of a line under the name of a formation.
+_LETTERS = 54
 
 
 def slots_or_layout(mission: Mission, name: str) -> tuple[Floats, bool]:
@@ -121,9 +125,11 @@ def draw_formation_sketch(
     elif sideways or not flat:
         turn = camera_axes(*np.radians([-70.0, 30.0 if flat else 16.0]))
     words += "" if placed else "; their distances fix no positions"
-    ax.set_title(st.clean_name(name), pad=22, fontsize=9, fontweight="bold", parse_math=False)
-    at: dict[str, Any] = {"transform": ax.transAxes, "ha": "center", "parse_math": False}
-    ax.text(0.5, 1.03, words, **at, fontsize=7.5, color=st.GREY)
+    ax.set_title(st.clean_name(name), pad=24, fontsize=9, fontweight="bold", parse_math=False)
+    ax.annotate(
+        textwrap.fill(words, _LETTERS), (0.5, 1), (0, 20), xycoords="axes fraction", parse_math=False,
+        textcoords="offset points", ha="center", va="top", fontsize=7.5, color=st.GREY,
+    )  # fmt: skip
     shown = lengths if len(edges) <= most else None
     draw_graph(ax, p @ turn.T, edges, colours, shown, dashed=dashed, lights=lit)
     return Sketch(p, placed, turn)
