@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,9 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from rigidfleet.mission import Mission
-
-#: Greatest length of a line under the name of a formation.
-_LETTERS = 54
 
 
 def slots_or_layout(mission: Mission, name: str) -> tuple[Floats, bool]:
@@ -117,19 +113,17 @@ def draw_formation_sketch(
     masses = mission.fleet.mass
     p = p - masses @ p / masses.sum()
     edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
-    thin = float(np.ptp(p[:, 2])) < 1e-3 * max(1e-9, float(np.ptp(p)))
-    flat = thin and distance_geometry.dimension(p, 1e-3) < 3
+    flat = float(np.ptp(p[:, 2])) < 1e-3 * max(1e-9, float(np.ptp(p)))
     turn, lit = np.eye(3), mission.formation_colours(name)
     if lit:
         turn = camera_axes(*view_angles(p))
     elif sideways or not flat:
         turn = camera_axes(*np.radians([-70.0, 30.0 if flat else 16.0]))
-    words += "" if placed else "; their distances fix no positions"
+    words += "" if placed else ";\ntheir distances fix no positions"
     ax.set_title(st.clean_name(name), pad=24, fontsize=9, fontweight="bold", parse_math=False)
-    ax.annotate(
-        textwrap.fill(words, _LETTERS), (0.5, 1), (0, 20), xycoords="axes fraction", parse_math=False,
-        textcoords="offset points", ha="center", va="top", fontsize=7.5, color=st.GREY,
-    )  # fmt: skip
+    at: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "top"}
+    look: dict[str, Any] = {"fontsize": 7.5, "color": st.GREY, "parse_math": False}
+    ax.annotate(words, (0.5, 1), (0, 20), "axes fraction", **at, **look)
     shown = lengths if len(edges) <= most else None
     draw_graph(ax, p @ turn.T, edges, colours, shown, dashed=dashed, lights=lit)
     return Sketch(p, placed, turn)
