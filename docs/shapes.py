@@ -149,9 +149,12 @@ def crossing() -> Figure:
         z = q[:, 2] + 0.3 * q[:, 1]
         for i, j in np.array(nine) - 1:
             right.plot(x[[i, j]], z[[i, j]], color=FLOWN, linewidth=1.4, zorder=1)
-        for i in range(5):
+        together = np.hypot(x[4] - x[3], z[4] - z[3]) < 0.5
+        for i in range(4 if together else 5):
             right.plot(x[i], z[i], "o", color=PALETTE[i], markersize=13, zorder=2)
             right.text(x[i], z[i], str(i + 1), color="white", fontsize=8, ha="center", va="center")
+        if together:
+            right.text(x[4] + 0.65, z[4], "and 5", color=PALETTE[4], fontsize=8, va="center")
         right.text(6.5 * k, -4.6, f"ends, {name}", color=colour, fontsize=8.5, ha="center")
     right.set(xlim=(-3.4, 9.9), ylim=(-5.0, 4.2))
     right.set_aspect("equal")

@@ -64,7 +64,7 @@ def _draw_formation(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | 
     words = f"{len(dashed)} edges"
     if rigidity is not None:
         words = f"{rigidity.rigidity_class}, rank {rigidity.rank} of {rigidity.needed}, {words}"
-        words += f", {len(redundant)} redundant" if redundant else ""
+        words += f",\n{len(redundant)} redundant" if redundant else ""
     sideways = rigidity is not None and any(f.motion[:, 2].any() for f in rigidity.flexes)
     look: dict[str, Any] = {"most": _FEW, "dashed": dashed, "sideways": sideways}
     drawn = sketches.draw_formation_sketch(ax, mission, name, colours, words, **look)

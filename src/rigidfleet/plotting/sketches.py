@@ -113,17 +113,17 @@ def draw_formation_sketch(
     masses = mission.fleet.mass
     p = p - masses @ p / masses.sum()
     edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
-    thin = float(np.ptp(p[:, 2])) < 1e-3 * max(1e-9, float(np.ptp(p)))
-    flat = thin and distance_geometry.dimension(p, 1e-3) < 3
+    flat = float(np.ptp(p[:, 2])) < 1e-3 * max(1e-9, float(np.ptp(p)))
     turn, lit = np.eye(3), mission.formation_colours(name)
     if lit:
         turn = camera_axes(*view_angles(p))
     elif sideways or not flat:
         turn = camera_axes(*np.radians([-70.0, 30.0 if flat else 16.0]))
-    words += "" if placed else "; their distances fix no positions"
-    ax.set_title(st.clean_name(name), pad=22, fontsize=9, fontweight="bold", parse_math=False)
-    at: dict[str, Any] = {"transform": ax.transAxes, "ha": "center", "parse_math": False}
-    ax.text(0.5, 1.03, words, **at, fontsize=7.5, color=st.GREY)
+    words += "" if placed else ";\ntheir distances fix no positions"
+    ax.set_title(st.clean_name(name), pad=24, fontsize=9, fontweight="bold", parse_math=False)
+    at: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "top"}
+    look: dict[str, Any] = {"fontsize": 7.5, "color": st.GREY, "parse_math": False}
+    ax.annotate(words, (0.5, 1), (0, 20), "axes fraction", **at, **look)
     shown = lengths if len(edges) <= most else None
     draw_graph(ax, p @ turn.T, edges, colours, shown, dashed=dashed, lights=lit)
     return Sketch(p, placed, turn)

@@ -22,6 +22,16 @@ async function order(command) {
   window.replay?.speak();
 }
 
+/** A slider with its value in a unit beside it. */
+function setting(parent, text, name, range) {
+  const lever = element("label", parent, { class: "lever value" }, text);
+  const input = element("input", lever, { type: "range", ...range });
+  const value = element("output", lever), write = () => (value.textContent = `${input.value} ${name}`);
+  input.addEventListener("input", write);
+  write();
+  return input;
+}
+
 const FAREWELL = "The flight has ended. This page can be closed.";
 
 class LivePlayer extends Player {
@@ -62,8 +72,7 @@ class LivePlayer extends Player {
     for (const [name, forward, left] of [["the left", 0, -1], ["the right", 0, 1], ["the front", -1, 0], ["behind", 1, 0]]) {
       element("button", gusts, { type: "button" }, name).addEventListener("click", () => this.gust(forward, left));
     }
-    const label = element("label", card, { class: "lever" }, "force");
-    this.strength = element("input", label, { type: "range", min: "0.5", max: "8", step: "0.5", value: "3", id: "strength" });
+    this.strength = setting(card, "force", "N/kg", { min: "0.5", max: "8", step: "0.5", value: "3", id: "strength" });
     if (info.loss !== null) this.network(card, info.loss);
     const ball = element("section", card, { id: "ball" });
     element("h2", ball, {}, "Ball");
@@ -72,15 +81,9 @@ class LivePlayer extends Player {
     add_.addEventListener("click", () => this.arm(!this.arming));
     const remove = element("button", row, { type: "button", id: "remove-ball", title: "Remove the ball with the ring (x)" }, "Remove");
     remove.addEventListener("click", () => this.removeBall());
-    const setting = (id, text, unit, most, value) => {
-      const lever = element("label", ball, { class: "lever value" }, text), { radius: [least] } = info.ball;
-      const input = element("input", lever, { type: "range", min: id === "radius" ? String(least) : "0", max: String(most), step: "0.1", value, id });
-      const told = element("output", lever), tell = () => (told.textContent = `${input.value} ${unit}`);
-      input.addEventListener("input", tell);
-      tell();
-    };
-    setting("radius", "radius", "m", info.ball.radius[1], "1");
-    setting("fling", "speed", "m/s", info.ball.speed, "0");
+    const [least, most] = info.ball.radius.map(String);
+    setting(ball, "radius", "m", { min: least, max: most, step: "0.1", value: "1", id: "radius" });
+    setting(ball, "speed", "m/s", { min: "0", max: String(info.ball.speed), step: "0.1", value: "0", id: "fling" });
     const guard = info.unguarded ? `Contact ends the flight: there is no guard (${info.unguarded})` : "Vehicles keep clear of balls, walls and ground";
     element("p", card, { id: "guard" }, guard);
     element("p", card, {}, "Keys: W A S D move, R F up and down, Q E turn, B adds a ball, drag moves it; space pauses");
@@ -128,14 +131,9 @@ class LivePlayer extends Player {
   /** A slider of the share of messages that links lose. */
   network(card, loss) {
     element("h2", card, {}, "Messages lost");
-    const lever = element("label", card, { class: "lever value" }, "share"), value = String(Math.round(100 * loss));
-    const input = element("input", lever, { type: "range", min: "0", max: "95", step: "5", value, id: "loss" });
-    const share = element("output", lever), write = () => (share.textContent = `${input.value} %`);
-    input.addEventListener("input", () => {
-      write();
-      order({ loss: Number(input.value) / 100 });
-    });
-    write();
+    const value = String(Math.round(100 * loss));
+    const input = setting(card, "share", "%", { min: "0", max: "95", step: "5", value, id: "loss" });
+    input.addEventListener("input", () => order({ loss: Number(input.value) / 100 }));
   }
 
   /** A slider that springs back when released. */
