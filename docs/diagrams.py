@@ -311,23 +311,11 @@ def solvers() -> Figure:
         linewidth=2.2,
         label="spectral: exact from $s_0$ = 0.1 on",
     )
-<<<<<<< HEAD
+    # Where no curve runs through the words.
     marks = ((1.5, "triangle"), (0.259, "cube"), (0.05, "cuboid"), (8e-4, "line, 8 cm off"))
     for at, name in marks:
         ax.vlines(at, 0.5, 2e4, color=FAINT, linewidth=0.9, linestyle=":")
         ax.text(at, 1.5e4, f" {name}", fontsize=8, color=GREY, va="top")
-=======
-    # Where no curve runs through the words.
-    marks = (
-        (1.5, "triangle", 1.5e4),
-        (0.259, "cube", 1.5e4),
-        (0.05, "cuboid", 1.5e4),
-        (8e-4, "line, 8 cm off", 30.0),
-    )
-    for at, name, top in marks:
-        ax.axvline(at, color=FAINT, linewidth=0.9, linestyle=":")
-        ax.text(at, top, f"{name} ", rotation=90, fontsize=8, color=GREY, va="top", ha="right")
->>>>>>> s60-pages
     ax.set(
         xlabel=r"eigenvalue $w$ of $\bar m A$", ylabel=r"gain $\varphi(w)/\bar m$", ylim=(0.08, 2e4)
     )

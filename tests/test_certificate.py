@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from rigidfleet import MissionError, assess, check, simulate
 from rigidfleet.formation import assignment, shapes
-from rigidfleet.math.products import product_in_blocks
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.preview import preview_phases
 from rigidfleet.result import Result
@@ -103,15 +102,6 @@ def test_missions_assign_where_heights_count_less():
     assert orders(assignment_downwash=4.0) == [0, 1, 2]
     with pytest.raises(MissionError, match="no effect with assignment 'shortest'"):
         orders(assignment="shortest", assignment_downwash=4.0)
-
-
-@pytest.mark.parametrize("shape", [(64, 6, 5000), (3000, 90, 20), (1, 1, 1), (0, 3, 4), (5, 3, 0)])
-def test_products_in_blocks_are_products(shape):
-    """A product in blocks is that of `numpy.einsum`, which uses no BLAS, to rounding."""
-    n, k, m = shape
-    rng = np.random.default_rng(1)
-    a, b = rng.normal(size=(n, k)), rng.normal(size=(k, m))
-    np.testing.assert_allclose(product_in_blocks(a, b), np.einsum("ik,kj->ij", a, b), atol=1e-12)
 
 
 def test_exchanges_end_at_any_points():

@@ -6,10 +6,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from rigidfleet.formation import distance_geometry, graphs, shapes
+from rigidfleet.formation import assignment, distance_geometry, graphs, shapes
 from rigidfleet.rigidity import RigidityClass, analyse, full_rank, jacobian
+from rigidfleet.rigidity import design as design_module
 from rigidfleet.rigidity.design import design, free_motions_text, mission_fragment
+from rigidfleet.sweep import Sweep, workers
 
 CUBE = shapes.slots("cube", 4.0, 8)
 BEST_CUBE = (3 - np.sqrt(5)) / 2  # 0.38197
@@ -28,6 +31,33 @@ def test_designed_cube_beats_the_paper():
     assert result.rigidity_class is RigidityClass.INFINITESIMALLY_RIGID
     assert result.w == pytest.approx(BEST_CUBE)
     assert index(CUBE, graphs.CUBE_EDGES) == pytest.approx(0.2586, abs=5e-5)
+
+
+def test_long_work_takes_one_thread_of_blas(monkeypatch):
+    """A design, exchanges of slots and a chunk of a sweep; afterwards there are as many as before."""
+    threads = []
+
+    def spy(module, name):
+        function = getattr(module, name)
+
+        def noting(*arguments):
+            threads.append({lib["num_threads"] for lib in threadpool_info()})
+            return function(*arguments)
+
+        monkeypatch.setattr(module, name, noting)
+
+    points = np.random.default_rng(1).normal(size=(1100, 3))
+    sweep = Sweep.of("narrow-passage", vary=["agents.mass.* *= normal(1, 0.05)"], runs=1)
+    with threadpool_limits(2, user_api="blas"):
+        spy(design_module, "_best_swap")
+        design(CUBE)
+        spy(assignment, "order_by_exchanges")
+        assignment.least_squares_assignment(points, points[::-1])
+        spy(workers, "fly_runs")
+        workers.fly_chunk(sweep.json(), sweep.version, [0])
+        assert len(threads) > 2
+        assert all(each == {1} for each in threads)
+        assert {lib["num_threads"] for lib in threadpool_info()} == {2}
 
 
 @pytest.mark.long

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.math.products import product_in_blocks
 from rigidfleet.math.rigid_body import centred, kabsch
 from rigidfleet.typing import Floats, Ints
 
@@ -186,7 +185,10 @@ def least_squares_assignment(p: Floats, q: Floats) -> Ints:
         orders = np.array(list(permutations(range(n))), dtype=np.int64)
         return orders[near[np.arange(n), orders].sum(axis=1).argmax()]
     if n > _LEAST:
-        return order_by_exchanges(p, q)
+        from threadpoolctl import threadpool_limits  # takes long to load
+
+        with threadpool_limits(1, user_api="blas"):  # its threads would wait actively
+            return order_by_exchanges(p, q)
     from scipy.optimize import linear_sum_assignment
 
     if n <= _FEW:
@@ -223,7 +225,7 @@ def order_by_exchanges(p: Floats, q: Floats) -> Ints:
             i = np.arange(first, min(first + _TOGETHER, n))
             while len(i):
                 own = np.einsum("ia,ia->i", p, slots)
-                crossed = product_in_blocks(np.hstack([p[i], slots[i]]), np.hstack([slots, p]).T)
+                crossed = np.hstack([p[i], slots[i]]) @ np.hstack([slots, p]).T
                 xy = own[i, None] + own - crossed
                 j = xy.argmin(axis=1)
                 gain = xy[np.arange(len(i)), j]

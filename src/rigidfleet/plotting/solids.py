@@ -150,8 +150,9 @@ def draw_obstacle_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     for at, share in zip(shape.at, _place_opacities(shape), strict=True):
         extent = ax.add_patch(PathPatch(Path(corner + at[:2]), **look, alpha=0.0))
         if not shape.grid:
-            area, opacity = area_from_above(shape.surface.triangles + at), 0.1 if shape.zone else 0.3
-            ax.add_artist(PathPatch(area, **look, alpha=opacity * float(share)))
+            opacity = (0.1 if shape.zone else 0.3) * float(share)
+            area = area_from_above(shape.surface.triangles + at)
+            ax.add_artist(PathPatch(area, **look, alpha=opacity))
         if shape.zone:
             lines = list((shape.surface.lines + at)[..., :2])
             ax.add_collection(LineCollection(lines, **dashed, alpha=float(share), zorder=1.1))

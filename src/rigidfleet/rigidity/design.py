@@ -14,13 +14,13 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from threadpoolctl import threadpool_limits
 
 from rigidfleet._common.arguments import as_numbers
 from rigidfleet._common.renamed import getattr_of_earlier_names
 from rigidfleet.errors import wrong_type
 from rigidfleet.formation.distance_geometry import dimension, distances
 from rigidfleet.formation.graphs import complete_graph
-from rigidfleet.math.products import product_in_blocks
 from rigidfleet.rigidity import full_rank, jacobian, rigid_motions
 from rigidfleet.rigidity.analysis import as_framework, flatten_points
 from rigidfleet.typing import Floats, Ints
@@ -42,6 +42,8 @@ _PATIENCE = 60
 _WORTH = 100
 
 
+# Threads of BLAS would wait actively: where other processes run, for up to ten times the processor time.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def design(
     slots: ArrayLike,
     *,
@@ -256,12 +258,12 @@ def _best_swap(rows: Floats, chosen: Ints, floor: float) -> tuple[int, int] | No
     r = A.shape[1]
     other = np.delete(np.arange(len(rows)), chosen)
     B = rows[other]
-    G = np.linalg.inv(product_in_blocks(A.T, A) - floor * np.eye(r))
-    AG, BG = product_in_blocks(A, G), product_in_blocks(B, G)
+    G = np.linalg.inv(A.T @ A - floor * np.eye(r))
+    AG, BG = A @ G, B @ G
     b1, b2 = 1 + (BG * B).sum(axis=1), (BG**2).sum(axis=1)
     top = np.argsort(-b2 / b1, kind="stable")[:_WORTH]
     other, B, BG, b1, b2 = other[top], B[top], BG[top], b1[top], b2[top]
-    cross, cross2 = (product_in_blocks(AG, X.T) for X in (B, BG))  # a G b and a G^2 b
+    cross, cross2 = AG @ B.T, AG @ BG.T  # a G b and a G^2 b
     a1, a2 = (AG * A).sum(axis=1), (AG**2).sum(axis=1)
     gain = b2 / b1
     left = 1 - a1[:, None] + cross**2 / b1
