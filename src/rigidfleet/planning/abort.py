@@ -23,7 +23,6 @@ from rigidfleet._common.text import agent_names
 from rigidfleet.math.piecewise import Piecewise, common_knots, concatenate_curves
 from rigidfleet.mission import Mission
 from rigidfleet.mission.boundaries import Worst
-from rigidfleet.mission.obstacles import Sphere
 from rigidfleet.planning.certificate import Certificate
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.homing import Home, WaysHome
@@ -86,18 +85,11 @@ class Abort:
 
 
 class _GroupAborts:
-    """Aborts of those vehicles that are not ``lost`` (N,), all at once, from any time of a plan."""
+    """Aborts of those vehicles for whom there are steps, all at once, from any time of a plan."""
 
-    def __init__(
-        self,
-        mission: Mission,
-        legs: Sequence[Leg],
-        plan: Piecewise,
-        wrecks: Sequence[Sphere],
-        lost: Bools,
-    ) -> None:
-        self.steps = Steps(mission, lost, wrecks)
-        self.path, self.homes = PlanSteps(self.steps, legs, plan), WaysHome(self.steps)
+    def __init__(self, steps: Steps, legs: Sequence[Leg], plan: Piecewise) -> None:
+        self.steps = steps
+        self.path, self.homes = PlanSteps(steps, legs, plan), WaysHome(steps)
         self._known: dict[bytes, Home] = {}
         self._known_past_still_things: dict[float, Home] = {}
         self._aborts: dict[float, Abort] = {}
@@ -172,14 +164,14 @@ class Aborts:
         lost = np.zeros(mission.n_agents, dtype=np.bool_) if lost is None else lost
         self.mission, self.options, self.plan = mission, mission.aborting, plan_path(legs)
         wrecks = wrecks_of(mission, self.plan, lost)
-        self._all = _GroupAborts(mission, legs, self.plan, wrecks, lost)
+        self._all = _GroupAborts(Steps(mission, lost, wrecks), legs, self.plan)
         self._end, self._lands = self._all.path.end, self._all.path.lands
         #: Those who leave, if not all do; they land where the plan leads them, if it lands.
         self._leavers = self._all
         if self.options.agents:
             stay = np.ones(mission.n_agents, dtype=np.bool_)
             stay[np.array(self.options.agents) - 1] = False
-            self._leavers = _GroupAborts(mission, legs, self.plan, wrecks, stay | lost)
+            self._leavers = _GroupAborts(Steps(mission, stay | lost, wrecks), legs, self.plan)
             if self._lands:
                 self._leavers.homes.start = self.plan.at(np.array([self._end]))[0]
 
