@@ -90,7 +90,7 @@ class _GroupAborts:
     def __init__(self, steps: Steps, legs: Sequence[Leg], plan: Piecewise) -> None:
         self.steps = steps
         self.path, self.homes = PlanSteps(steps, legs, plan), WaysHome(steps)
-        self._known: dict[bytes, Home] = {}
+        self._known: dict[tuple[bytes, float], Home] = {}
         self._known_past_still_things: dict[float, Home] = {}
         self._aborts: dict[float, Abort] = {}
 
@@ -120,11 +120,9 @@ class _GroupAborts:
 
         If nothing leads home from there, back along the plan to where a way does.
         """
-        r, path = stop.end, stop.path
+        r, path, when = stop.end, stop.path, begin if self.steps.moves else 0.0
         assert path is not None
-        key = np.round(r, _SAME).tobytes() + (
-            np.array([begin]).tobytes() if self.steps.moves else b""
-        )
+        key = np.round(r, _SAME).tobytes(), when
         if key not in self._known:
             home = self.homes.straight_ways_home(r, begin)
             if home.reason and np.isfinite(self.homes.landing_places(r)).all():
@@ -183,9 +181,9 @@ class Aborts:
 
     def abort_at(self, ordered: float) -> Abort:
         """What follows from an order at a time [s]."""
-        return (
-            self._abort_of_leavers(ordered) if self.options.agents else self._all.abort_at(ordered)
-        )
+        if self.options.agents:
+            return self._abort_of_leavers(ordered)
+        return self._all.abort_at(ordered)
 
     def _abort_of_leavers(self, ordered: float) -> Abort:
         """Some vehicles go home, as soon as they come near no other one; the others fly the plan on."""
@@ -193,9 +191,8 @@ class Aborts:
         who = self._leavers.steps.left
         order = np.concatenate([who, np.setdiff1d(everyone.left, who)])
         problem = "there is no time left" if who.size else "those who would leave are lost"
-        plan = self._all.path.step_by_clock(
-            "", path_clock(begins, max(end - begins, SHORTEST), ON)
-        ).least
+        clock = path_clock(begins, max(end - begins, SHORTEST), ON)
+        plan = self._all.path.step_by_clock("", clock).least
         for waits in np.arange(0.0, end - begins, self.options.step).tolist() if who.size else ():
             alone = self._leavers.abort_at(ordered + waits)
             if alone.home.reason:
@@ -240,11 +237,8 @@ class Aborts:
         """
         from scipy.spatial import KDTree
 
-        left, radius, (least, most, each) = (
-            self._all.steps.left,
-            self.mission.fleet.radius,
-            _SAMPLED,
-        )
+        left, radius = self._all.steps.left, self.mission.fleet.radius
+        least, most, each = _SAMPLED
         step = min(max(least, each * self.mission.n_agents), most)
         time = np.arange(abort.begins, min(abort.rest_time, self._end), step)
         if len(left) < 2 or not len(time):

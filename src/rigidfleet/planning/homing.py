@@ -103,18 +103,12 @@ class WaysHome:
 
     def _places_clear_of_wrecks(self, r: Floats, own: Floats, off: float) -> Floats:
         """The own places (n, 3) of those left; where a lost vehicle lies on one, that of a lost one if it is free."""
-        if not self.steps.wrecks:
+        steps, every = self.steps, self.landing_places(r, off)
+        if not steps.wrecks:
             return own
-        every = self.landing_places(r, off)
-        near = (
-            proximity.obstacle_clearances(every, self.steps.radius, self.steps.wrecks, _EVER)[0]
-            < PACE
-        )
-        own, spare, taken = (
-            own.copy(),
-            every[self.steps.lost & ~near],
-            np.flatnonzero(near[self.steps.left]),
-        )
+        room, _ = proximity.obstacle_clearances(every, steps.radius, steps.wrecks, _EVER)
+        near = room < PACE
+        own, spare, taken = own.copy(), every[steps.lost & ~near], np.flatnonzero(near[steps.left])
         count = min(len(spare), len(taken))
         own[taken[:count]] = spare[:count]
         return own

@@ -98,8 +98,7 @@ class Steps:
         self.mission, self.lost, self.wrecks = mission, lost, wrecks
         self.left, self.radius = np.flatnonzero(~lost), mission.fleet.radius
         self.limits, self.need = limits_of(mission), kept_distances(mission)[0]
-        rotors = has_rotors(mission)
-        sinking = _SINKING if rotors else math.inf
+        sinking = _SINKING if has_rotors(mission) else math.inf
         self.home_limits = capped_limits(
             mission, acceleration=BRAKING, jerk=JERK, speed=_SPEED, vertical_speed=sinking
         )
