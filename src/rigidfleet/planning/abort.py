@@ -27,9 +27,9 @@ from rigidfleet.planning.certificate import Certificate
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.homing import Home, WaysHome
 from rigidfleet.planning.legs import Leg
-from rigidfleet.planning.plan_path import BLEND, ON, PlanSteps, path_clock, plan_path
+from rigidfleet.planning.plan_path import ON, REST_TO_REST, PlanSteps, path_clock, plan_path
 from rigidfleet.planning.reference import PhaseState, Pose, copy_with
-from rigidfleet.planning.steps import APART_FOR_EVER, FASTEST, SHORTEST, Step, Steps
+from rigidfleet.planning.steps import APART_FOR_EVER, PEAK_SPEED, SHORTEST, Step, Steps
 from rigidfleet.planning.wrecks import wrecks_of
 from rigidfleet.typing import Bools, Floats
 
@@ -143,9 +143,9 @@ class _GroupAborts:
                 continue
 
             def backward_clock(duration: float, far: float = path - place) -> Piecewise:
-                return path_clock(path, duration, -far / duration * BLEND)
+                return path_clock(path, duration, -far / duration * REST_TO_REST)
 
-            first = FASTEST * (path - place)
+            first = PEAK_SPEED * (path - place)
             time, _ = self.path.least_time_and_ratios(first, self.steps.home_limits, backward_clock)
             if self.steps.moves:
                 home = self.homes.straight_ways_home(r, begin + time)

@@ -12,7 +12,7 @@ from rigidfleet.math import proximity
 from rigidfleet.planning.avoidance import why_no_landing
 from rigidfleet.planning.courses import ABOVE
 from rigidfleet.planning.levels import altitude_levels
-from rigidfleet.planning.steps import PACE, Step, Steps
+from rigidfleet.planning.steps import CLEARANCE_STEP, Step, Steps
 from rigidfleet.typing import Floats
 
 #: Height of the last straight way down [m].
@@ -107,7 +107,7 @@ class WaysHome:
         if not steps.wrecks:
             return own
         room, _ = proximity.obstacle_clearances(every, steps.radius, steps.wrecks, _EVER)
-        near = room < PACE
+        near = room < CLEARANCE_STEP
         own, spare, taken = own.copy(), every[steps.lost & ~near], np.flatnonzero(near[steps.left])
         count = min(len(spare), len(taken))
         own[taken[:count]] = spare[:count]

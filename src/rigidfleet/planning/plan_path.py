@@ -38,7 +38,7 @@ _LEAST = 0.01
 _SLOWING = np.array([0.0, 1.0, 0.0, 0.0, -2.5, 3.0, -1.0])
 ON = np.array([0.0, 1.0])
 #: From rest to rest, by that share.
-BLEND = septic_polynomial(np.polynomial.Polynomial(ON)).coef
+REST_TO_REST = septic_polynomial(np.polynomial.Polynomial(ON)).coef
 #: Greatest change of the rate and of that, over powers of the time of slowing down.
 _STEEPEST, _BENT = 1.875, 5.774
 

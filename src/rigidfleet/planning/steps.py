@@ -37,11 +37,11 @@ SHORTEST, _LONGER, _TRIES = 0.5, 1.1, 60
 #: Share of a limit that steps may use, which are looked at in samples alone; share of that which counts as kept.
 USED, KEPT = 0.98, 1.0 + 1e-6
 #: Samples of a step at which limits are looked at, and greatest way between two, halved, at which clearance is [m].
-LOOKS, PACE = 33, 0.25
+LOOKS, CLEARANCE_STEP = 33, 0.25
 #: How much farther than in the end vehicles are off their ways while drag changes.
 _OVERSHOOT = 1.1
 #: Greatest speed from rest to rest, over the mean.
-FASTEST = 2.1875
+PEAK_SPEED = 2.1875
 #: Room for a vehicle whose centre is off its way: sideways alone.
 _ASIDE = np.array([1.0, 1.0, 0.0])
 APART_FOR_EVER = Certificate(math.inf, 0.0, (0, 0), "closed form")
@@ -143,7 +143,7 @@ class Steps:
 
         lands = name == "down"
         longest = float(np.linalg.norm(end - start, axis=1).max())
-        time, _ = shortest_time(FASTEST * longest / (DESCENT if lands else _SPEED), limit_ratios)
+        time, _ = shortest_time(PEAK_SPEED * longest / (DESCENT if lands else _SPEED), limit_ratios)
         least = prove_straight_ways(start, end, time, self.radius, self.lost) or APART_FOR_EVER
         return self.step(name, partial(_rest_to_rest, start, end, time), least, 0.0, lands=lands)
 
@@ -172,7 +172,7 @@ class Steps:
             shift_bound(x.solid, when, when + step.duration)[0] for x in things if x.solid.moves
         )
         far += max(moved, default=0.0)
-        time = np.linspace(0.0, step.duration, 2 + math.ceil(far / PACE / 2.0))
+        time = np.linspace(0.0, step.duration, 2 + math.ceil(far / CLEARANCE_STEP / 2.0))
         r = way.at(time)[:, left]
         if limits.geofence is not None and not along:
             low, high = (np.array(x) for x in (limits.geofence.min, limits.geofence.max))
@@ -203,7 +203,7 @@ class Steps:
         if things:
             room, near = proximity.obstacle_clearances(r, radius, things, begin + time)
             k, i = np.unravel_index(int(room.argmin()), room.shape)
-            if room[k, i] < PACE:  # less than half the way between two samples
+            if room[k, i] < CLEARANCE_STEP:  # less than half the way between two samples
                 thing = things[int(near[k, i])].name
                 return f"'{thing}' stands in the way of agent {left[i] + 1} {on}"
         return ""
