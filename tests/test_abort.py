@@ -15,7 +15,11 @@ import pytest
 import rigidfleet as rf
 from rigidfleet.cli.app import main
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.planning.abort import Aborts, _altitude_levels
+from rigidfleet.planning.abort import Aborts
+from rigidfleet.planning.homing import WaysHome
+from rigidfleet.planning.levels import altitude_levels
+from rigidfleet.planning.plan_path import plan_path
+from rigidfleet.planning.steps import Steps, tracking_allowance
 from rigidfleet.planning.timing import complete_times, legs_up_to
 from rigidfleet.preflight.aborts import check_aborts
 from rigidfleet.simulation.together import simulate_together
@@ -220,8 +224,10 @@ def test_drag_that_grows_with_the_square_of_the_speed_holds_vehicles_back_too() 
     assert not mission.drag.any()
     aborts = aborts_of(mission)
     over, down = aborts.abort_at(8.0).home.steps
-    assert down.off == pytest.approx(aborts.off, abs=1e-12)  # as far down for all
-    assert over.off > aborts.off + 0.01
+    assert down.off == pytest.approx(
+        tracking_allowance(aborts.mission), abs=1e-12
+    )  # as far down for all
+    assert over.off > tracking_allowance(aborts.mission) + 0.01
 
 
 @pytest.mark.parametrize("to", ["any", "own"])
@@ -366,7 +372,7 @@ def test_levels_keep_who_is_above() -> None:
     """Of two ways that cross as seen from above, levels differ; who is above at first has the higher level."""
     rng = np.random.default_rng(4)
     p, q = rng.uniform(0.0, 6.0, (30, 3)), rng.uniform(0.0, 12.0, (30, 3))
-    level = _altitude_levels(1.0, p, q)
+    level = altitude_levels(1.0, p, q)
     s = np.linspace(0.0, 1.0, 2001)[:, None]
     crossing = 0
     for i, j in itertools.combinations(range(30), 2):
@@ -546,8 +552,9 @@ def test_ways_home_leave_vehicles_room_beside_fences(beside: float, home: bool) 
             {"kind": "land", "duration": 8.0},
         ],
     })  # fmt: skip
-    abort = aborts_of(mission)
-    assert bool(abort.straight_ways_home(abort.plan.at(np.array([16.0]))[0], 16.0).way) == home
+    homes, when = WaysHome(Steps(mission, np.zeros(2, dtype=np.bool_))), np.array([16.0])
+    places = plan_path(legs_up_to(mission, len(mission.phases))).at(when)[0]
+    assert bool(homes.straight_ways_home(places, 16.0).way) == home
 
 
 def test_what_stands_in_the_way_is_named() -> None:

@@ -460,6 +460,17 @@ def test_missions_cross_processes():
     assert again.text == mission.text
 
 
+def test_a_mission_that_is_changed_has_a_text_of_its_own():
+    """Other phases, or another assignment, are in the text, whose digest a report names; known times leave it."""
+    data = load_mission("square").to_dict()
+    mission = Mission.from_dict(data)
+    later = [x | {"name": f"{k}"} for k, x in enumerate(data["phases"])]
+    for other in (mission.with_phases(later), mission.with_assignment("safe")):
+        assert other.digest != mission.digest
+        assert Mission.from_toml(other.text).model_dump() == other.model_dump()
+    assert mission.with_phases(data["phases"]).digest == mission.digest
+
+
 def test_a_copy_has_nothing_that_follows_from_what_is_changed():
     """A copy of a mission that has flown is flown with its own gusts, masses and roofs."""
     mission = load_mission("windy-passage")

@@ -28,6 +28,8 @@ FORESEEN = {
     "downwash": ("separation_below",),
     "obstacle": ("clearance",),
     "geofence": ("geofence",),
+    "fence": ("fence",),
+    "people": ("people",),
     "formation": ("shape", "distances"),
     "settle": ("settled",),
     "landing": ("touch_down",),
@@ -77,6 +79,14 @@ MOVED = {
     ),
     "geofence": lambda x: mission(
         limits={"geofence": {"min": [-9, -9, 0], "max": [20, 4.2, 9]}},
+        disturbances={"wind": [0, 6.0 * x, 0], "drag": 0.1},
+    ),
+    "fence": lambda x: mission(
+        fences=[{"kind": "inclusion", "polygon": [[-9, -9], [20, -9], [20, 4.2], [-9, 4.2]]}],
+        disturbances={"wind": [0, 6.0 * x, 0], "drag": 0.1},
+    ),
+    "people": lambda x: mission(
+        people=[{"polygon": [[-9, 4.85], [20, 4.85], [20, 9], [-9, 9]]}],
         disturbances={"wind": [0, 6.0 * x, 0], "drag": 0.1},
     ),
     "formation": lambda x: mission(

@@ -172,10 +172,15 @@ def _distance_outside(region: Region, inclusion: bool, curves: Floats, _: Ints) 
 
 
 class BoundaryWatch:
-    """Finds the worst values of curves beside fences and people."""
+    """Finds the worst values of curves beside fences and people.
 
-    def __init__(self, mission: Mission) -> None:
-        self.every = Boundaries(mission).every
+    With ``floors``, ranks by quantity, those alone that are worse, and of these quantities alone.
+    """
+
+    def __init__(self, mission: Mission, floors: dict[str, float] | None = None) -> None:
+        every = Boundaries(mission).every
+        self.every = [x for x in every if floors is None or x.quantity in floors]
+        self._floors = floors or {}
         #: By quantity, since it was last asked for.
         self.worst: dict[str, Worst] = {}
         #: Starts, lengths and control points that are not searched yet, and whose of the agents count.
@@ -231,7 +236,8 @@ class BoundaryWatch:
             q = QUANTITIES[x.quantity]
             known = self.worst.get(x.quantity)
             start = x.measure(states, every)[0]
-            least = -np.inf if known is None else float(q.rank(known.value))
+            least = self._floors.get(x.quantity, -np.inf)
+            least = least if known is None else float(q.rank(known.value))
             if start.max() > least:
                 k = int(start.argmax())
                 least = float(start[k])

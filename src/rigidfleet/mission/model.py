@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from copy import copy
 from functools import cached_property, wraps
 from hashlib import sha256
+from itertools import zip_longest
 from typing import Any, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -34,6 +35,7 @@ from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
 from rigidfleet.mission.phases import latest_end_of_phases
 from rigidfleet.mission.schema import DRAG, Aborting, Contents, Disturbances
 from rigidfleet.mission.text import parse_toml, text_error
+from rigidfleet.mission.values import AUTO
 from rigidfleet.mission.vehicles import VehicleModel, model_of_vehicle
 from rigidfleet.solids.distance import top_of_solids_below
 from rigidfleet.solids.records import Solids, join_solids
@@ -192,24 +194,32 @@ class Mission(Contents, Shown):
         return mission
 
     def with_phases(self, phases: list[dict[str, Any]]) -> Self:
-        """Return the mission with other tables of phases, checked. It is written as before.
+        """Return the mission with other tables of phases, checked.
+
+        It is written as before if it differs in automatic times alone, which follow from that text.
 
         Raises
         ------
         MissionError
             With a finding for each error.
         """
-        mission = self.rewritten(self._data | {"phases": phases})
-        mission._data, mission._text = self._data, self._text
+        written, mission = self._data["phases"], self.rewritten(self._data | {"phases": phases})
+        if [
+            _phase_but_times(x, y) for x, y in zip_longest(phases, written, fillvalue={})
+        ] == written:
+            mission._data, mission._text = self._data, self._text
         return mission
 
     def with_assignment(self, assignment: str) -> Self:
         """Return the mission as it is, with its times known, but with agents assigned to slots otherwise; unchecked.
 
-        It has no text: from a text, automatic times would be unknown again.
+        It is written with the new assignment, and with automatic times as before.
         """
         parts = {name: getattr(self, name) for name in Contents.model_fields}
-        return self.model_construct(self.model_fields_set, **parts | {"assignment": assignment})
+        other = self.model_construct(self.model_fields_set, **parts | {"assignment": assignment})
+        other._data = self._data | {"assignment": assignment}
+        other._about, other._origin = self.file_digests_text, self._origin
+        return other
 
     @property
     def size_in_words(self) -> str:
@@ -638,6 +648,15 @@ class Mission(Contents, Shown):
     def on_loss(self) -> Literal["continue", "hold", "land", "abort"]:
         """What the others do when a vehicle or link is lost."""
         return self.all_disturbances.on_loss
+
+
+def _phase_but_times(table: dict[str, Any], written: dict[str, Any]) -> dict[str, Any]:
+    """A table of a phase with automatic times, and those of its points, as they are written."""
+    auto = {key for key, x in written.items() if x == AUTO}
+    places = [[x["position"] for x in one.get("through", ())] for one in (table, written)]
+    if auto and places[0] == places[1]:
+        auto |= {"through"} & written.keys()
+    return table | {key: written[key] for key in auto}
 
 
 def _automatic_damping(mission: Mission, name: str, *lost: int) -> float:

@@ -16,23 +16,24 @@ import numpy as np
 
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import Brake, Hold, Land, Reshape, Turn
-from rigidfleet.planning.abort import (
-    BRAKING,
-    DESCENT,
-    JERK,
-    SHORTEST,
-    Aborts,
-    abandonment_state,
-    capped_limits,
-    phases_of,
-    shortest_time,
-)
+from rigidfleet.planning.abort import Aborts, abandonment_state
 from rigidfleet.planning.clearance import CLEARANCE_ACCURACY, clearance_to, speed_bounds
 from rigidfleet.planning.courses import climb_distances, height_above_landing
 from rigidfleet.planning.legs import Leg, depart, leg_from, leg_of, phase_spans
 from rigidfleet.planning.limits import use_of_limits
+from rigidfleet.planning.plan_path import PlanSteps
 from rigidfleet.planning.preview import FEWEST_SAMPLES, sample_leg
 from rigidfleet.planning.reference import PhaseState
+from rigidfleet.planning.steps import (
+    BRAKING,
+    DESCENT,
+    JERK,
+    SHORTEST,
+    Steps,
+    capped_limits,
+    phases_of,
+    shortest_time,
+)
 from rigidfleet.planning.timing import legs_from
 from rigidfleet.typing import Floats
 
@@ -97,7 +98,8 @@ def loss_legs(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg
     # Slots on ways of their own are where they should be only with the body's way.
     if (start.blend is not None and start.formation is None) or _hits_obstacle(mission, legs[0]):
         whole = plan()
-        slow, *_ = Aborts(mission, whole, start.lost).slow_down_step_and_problem(start.t)
+        along = PlanSteps(Steps(mission, start.lost), whole)
+        slow, _ = along.slow_down_step_and_problem(start.t)
         brake = phases_of(mission, [slow._replace(name="brake (loss)")])
         legs = legs_from(mission, abandonment_state(whole, start), brake)
         now = legs[-1].planned_end_state

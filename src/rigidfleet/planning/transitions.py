@@ -22,9 +22,11 @@ from rigidfleet.math import rigid_body
 from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Reshape, Vertical
 from rigidfleet.mission.values import AUTO
-from rigidfleet.planning.abort import Aborts, Step, first_free_level, neighbours_on_ways, phases_of
+from rigidfleet.planning.homing import WaysHome
 from rigidfleet.planning.legs import Leg, state_at_start
+from rigidfleet.planning.levels import layer_levels, neighbours_on_ways
 from rigidfleet.planning.reference import PhaseState
+from rigidfleet.planning.steps import Step, Steps, phases_of
 from rigidfleet.planning.transfers import plan_transfer
 from rigidfleet.planning.ways import LegsUpTo, error_of_key
 from rigidfleet.typing import Floats
@@ -148,7 +150,7 @@ def _expand_stagger(
 def _phases_to_own_places(
     mission: Mission, number: int, table: dict[str, Any], phase: Vertical, now: PhaseState | None
 ) -> list[dict[str, Any]]:
-    """The phases in which each vehicle flies to where it stood at the start, and lands (`planning.abort`).
+    """The phases in which each vehicle flies to where it stood at the start, and lands (`planning.homing`).
 
     Raises
     ------
@@ -156,7 +158,7 @@ def _phases_to_own_places(
         The vehicles did not stand on the ground, no way is proved, or there is too little time for it.
     """
     mistake = partial(error_of_key, mission, number)
-    homes = Aborts(mission, (), to="own")
+    homes = WaysHome(Steps(mission, np.zeros(mission.n_agents, dtype=np.bool_)), to="own")
     problem = "needs vehicles that stand on the ground at the start, and known slots before"
     steps: tuple[Step, ...] = ()
     if now is not None and now.goal is not None and now.slots is not None and homes.stands:
@@ -287,7 +289,7 @@ def _layer_stops(
             return None
     apart = 2.0 * float(radius.max()) + limit + limits.separation_allowance
     height = max(apart, 2.0 * float(radius.max()) + (limits.separation_below or 0.0))
-    level = height * _flight_levels(neighbours_on_ways(apart, p, q))
+    level = height * layer_levels(neighbours_on_ways(apart, p, q))
     one, two = (np.column_stack([x[:, :2], level]) for x in (p, q))
     stops = [p, one, two, q]
     for (a, b), part in zip(pairwise(stops), _PARTS, strict=True):
@@ -301,18 +303,6 @@ def _layer_stops(
             remedy = "place slots farther apart as seen from above, or lower limits.separation"
             raise error_of_key(mission, number, "transition", phase.transition, problem, remedy)
     return stops
-
-
-def _flight_levels(near: list[list[int]]) -> Floats:
-    """Level (N,) of each agent, ... -1, 0, 1, ..., such that no two that are near each other are within a level."""
-    colour = np.full(len(near), -1)
-    for i in np.argsort([-len(others) for others in near], kind="stable").tolist():
-        colour[i] = first_free_level(colour[near[i]])
-    # The fullest in the middle: 0, 1, -1, 2, -2, ...
-    order = np.argsort(-np.bincount(colour), kind="stable")
-    place = np.empty(len(order))
-    place[order] = [(k + 1) // 2 * (1 if k % 2 else -1) for k in range(len(order))]
-    return place[colour]
 
 
 def _layer_phases(

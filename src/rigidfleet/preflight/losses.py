@@ -10,9 +10,9 @@ import numpy as np
 
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission
-from rigidfleet.planning.abort import Aborts
 from rigidfleet.planning.legs import Leg
 from rigidfleet.planning.losses import Answer, answer_to_loss
+from rigidfleet.planning.plan_path import plan_path
 from rigidfleet.planning.preview import (
     FEWEST_SAMPLES,
     PlannedPhase,
@@ -20,6 +20,7 @@ from rigidfleet.planning.preview import (
     samples_per_phase,
 )
 from rigidfleet.planning.reference import copy_with
+from rigidfleet.planning.wrecks import fall_uncertainty, wrecks_of
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
 from rigidfleet.preflight.obstacles import area_remarks, obstacle_remarks
 from rigidfleet.preflight.offsets import steady_offset_remarks
@@ -83,10 +84,9 @@ def loss_remarks(
     most = max(samples_per_phase(mission), FEWEST_SAMPLES)
     phases = [sample_leg(x, most) for x in way]
     yield from _path_remarks(mission, preflight, phases)
-    aborts = Aborts(mission, legs, mission.lost_at <= first)
     # Where the loss comes after a phase that ends by settling, where it falls is an estimate.
     sure = all(x.phase.settle is None for x in legs if x.start < first)
-    yield from _wreck_remarks(aborts, phases, sure=sure)
+    yield from _wreck_remarks(mission, legs, phases, sure=sure)
     for remark in steady_offset_remarks(mission, preflight, phases):
         yield remark if sure else replace(remark, level="note")
 
@@ -102,19 +102,21 @@ def _path_remarks(
         yield from judge(mission, part)
 
 
-def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase], *, sure: bool) -> Iterator[Remark]:
+def _wreck_remarks(
+    mission: Mission, legs: Sequence[Leg], way: Sequence[PlannedPhase], *, sure: bool
+) -> Iterator[Remark]:
     """Remarks on those left who hit a lost vehicle that falls or lies, at samples of the way after the loss."""
-    left, radius = aborts.left, aborts.radius[aborts.left] - aborts.fall_uncertainty.max()
-    for planned in way if aborts.wrecks else ():
+    lost = mission.lost_at <= mission.abandons_at
+    wrecks, left = wrecks_of(mission, plan_path(legs), lost), np.flatnonzero(~lost)
+    radius = mission.fleet.radius[left] - fall_uncertainty(mission).max()
+    for planned in way if wrecks else ():
         r, time = planned.position[:, left], planned.time
-        room, near = proximity.obstacle_clearances(r, radius, aborts.wrecks, time)
+        room, near = proximity.obstacle_clearances(r, radius, wrecks, time)
         k, i = np.unravel_index(int(room.argmin()), room.shape)
         if room[k, i] < 0.0:
-            wreck = aborts.wrecks[int(near[k, i])].name
-            text = (
-                f"{'hits' if sure else 'may hit'} '{wreck}' at {time[k]:.2f} s in '{planned.phase}'"
-            )
-            yield Remark("fails" if sure else "note", "loss", f"agent {left[i] + 1} {text}")
+            hits, wreck = "hits" if sure else "may hit", wrecks[int(near[k, i])].name
+            text = f"agent {left[i] + 1} {hits} '{wreck}' at {time[k]:.2f} s in '{planned.phase}'"
+            yield Remark("fails" if sure else "note", "loss", text)
 
 
 def planned_answer_to_loss(mission: Mission, at: Leg, legs: Sequence[Leg]) -> Answer:

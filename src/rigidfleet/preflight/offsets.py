@@ -25,7 +25,7 @@ from rigidfleet.planning.vehicles import drag_and_lift, pair_jet_speeds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
 from rigidfleet.preflight.margins import phase_gains
-from rigidfleet.preflight.obstacles import obstacle_remarks
+from rigidfleet.preflight.obstacles import area_remarks, obstacle_remarks
 from rigidfleet.preflight.trajectory import downwash_remarks, measured_remarks, separation_remarks
 from rigidfleet.preflight.vehicles import STACKED
 from rigidfleet.typing import Floats
@@ -192,6 +192,7 @@ def _broken_limits_in_words(
     there = Preflight(mission, preflight.formations, preflight.gains, [moved], [moved])
     remarks = [*separation_remarks(mission, there), *downwash_remarks(mission, there)]
     remarks += [*measured_remarks(mission, moved), *obstacle_remarks(mission, there)]
+    remarks += area_remarks(mission, there)
     broken = {remark.topic: remark.text for remark in remarks if remark.level == "fails"}
     proved, least = leg.certificate, there.separation
     if proved is not None and least is not None:
