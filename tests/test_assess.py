@@ -608,6 +608,17 @@ def test_the_rotor_nearest_to_its_limit_names_its_vehicle(agent):
     assert f"the rear left rotor of agent {agent + 1} gives up to 4.5 N" in check.message
 
 
+@pytest.mark.parametrize(("share", "passed"), [(1.0, True), (1 + 5e-10, True), (1 + 2e-9, False)])
+def test_a_rotor_at_its_limit_keeps_it(share, passed):
+    """But for rounding, of a billionth."""
+    flight = quadrotors(3, 4.0)
+    assert flight.rotor_force is not None
+    flight.rotor_force[:] = 2.5
+    limit = found(assess(flight), "rotor_force").limit
+    flight.rotor_force[4, 1, 0] = share * limit
+    assert found(assess(flight), "rotor_force").passed is passed
+
+
 @pytest.mark.parametrize(
     ("down", "words"), [(1, "1 vehicle"), (2, "2 vehicles"), (3, "3 vehicles")]
 )

@@ -51,7 +51,7 @@ def test_check_reads_a_file_once(name, texts, capsys):
 
 
 def test_run_reads_a_file_once(texts, tmp_path, capsys):
-    """It writes the text of the result alone, which has the way that was found and the times that were computed."""
+    """It writes the text of the result alone, which is the file's: automatic times stay so, and follow again."""
     file = tmp_path / "short.toml"
     lost = {"disturbances": {"lost": [{"agent": 3, "time": 8.0}], "on_loss": "land"}}
     data = three_points(ESTABLISH, FLY) | LIMITS | GROUND | lost

@@ -134,6 +134,9 @@ def sweep(
     """
     if merge + summary + bool(shard) > 1:
         raise RigidfleetError("--shard, --merge and --summary exclude each other: use one of them.")
+    if out is not None and (merge or summary):
+        words = "Give the folder of the sweep in place of the mission, and no --out"
+        raise RigidfleetError(f"--merge and --summary read a sweep where it is. {words}.")
     from rigidfleet._common.files import write_file
     from rigidfleet.sweep import figures, fly, shards, store
     from rigidfleet.sweep.record import UNJUDGED, reason_in_words

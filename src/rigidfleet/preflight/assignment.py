@@ -42,6 +42,8 @@ def assignment_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         preflight.assignments[name] = Assignment(order, length, clearance)
     now, short, safe = preflight.assignments.values()
     before, after = now.path_length_m, short.path_length_m
+    if before < _SHORT:  # they are in their slots: there is nothing to compare
+        preflight.assignments.clear()
     if after < (1 - _WORTH) * before - _SHORT:
         text = f'assignment = "shortest" reduces the total path length from {before:.1f} m to {after:.1f} m'
         yield Remark("note", "assignment", text)

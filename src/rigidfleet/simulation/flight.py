@@ -393,14 +393,14 @@ class Flight:
             check_phase_can_begin(self.mission, phase)
         self._leave_phase(changed=True)
         if self.mission.on_loss == "continue" or not self._is_from_route(phase):
-            self._reached = copy_with(self._state_now, blend=None)
+            self._reached = copy_with(self._next_start_state, blend=None)
         if self._phases_begun:
             self._report_progress(phase, planning=True)
         try:
             # Avoidance leads the body beside its plan, from where a follow leads back; never the slots about it.
             evades = phase.follows_curves and not by_hand and layers(self.mission) is not None
             if by_hand or self._phases_begun or self.external is not None:
-                where = self._state_now, len(self._phases_begun)
+                where = self._next_start_state, len(self._phases_begun)
                 leg = timed_leg(self.mission, phase, *where, anywhere=evades)
                 own = {"disturbance": self._disturbance, "external": self._push}
                 plan = plan_phase(self.mission, leg, **own)
@@ -640,7 +640,7 @@ class Flight:
     # -- inside -----------------------------------------------------------------------------------
 
     @property
-    def _state_now(self) -> PhaseState:
+    def _next_start_state(self) -> PhaseState:
         """The state from which the next phase starts, evaluated when it is asked for: none follows the last."""
         if self._ended is not None:
             self._reached = self._ended.end()
@@ -678,11 +678,13 @@ class Flight:
     def _react_to_loss(self) -> None:
         """Replace the rest of the route by what the mission asks for after a loss."""
         self._reacted = True
-        lost = self.mission.lost_at <= self._state_now.t
+        lost = self.mission.lost_at <= self._next_start_state.t
         if lost.any():
             self._extremes.remove_lost(lost)
-            self._reached = copy_with(self._state_now, lost=lost)
-        self._answer = answer_to_loss(self.mission, self._state_now, self._legs_begun_and_ahead)
+            self._reached = copy_with(self._next_start_state, lost=lost)
+        self._answer = answer_to_loss(
+            self.mission, self._next_start_state, self._legs_begun_and_ahead
+        )
         legs = self._answer.legs
         if legs:
             self._reached = legs[0].before
@@ -747,7 +749,7 @@ class Flight:
     def _stop_if_flipped(self, plan: PhasePlan) -> None:
         """Stop if the formation has flipped: its slots no longer agree with the body frame."""
         both = {plan.phase.leads_body, *(phase.leads_body for phase in self._phases_begun[-1:])}
-        now = self._state_now
+        now = self._next_start_state
         if self.flips or not all(both) or now.frame is None or plan.frame is None:
             return
         angle = att.angle_between(
