@@ -125,7 +125,8 @@ def area_from_above(triangles: Floats) -> Path:
     flat = np.where(
         below[:, None, None], flat[:, ::-1], flat
     )  # all turn left, so that none cuts another out
-    return Path.make_compound_path(*(Path([*x, x[0]], closed=True) for x in flat))
+    codes = np.tile([Path.MOVETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY], len(flat))
+    return Path(flat[:, [0, 1, 2, 0]].reshape(-1, 2), codes)
 
 
 def draw_obstacle_from_above(ax: Axes, shape: DrawnObstacle) -> None:
