@@ -1,4 +1,5 @@
 import tomllib
+from contextlib import ExitStack
 from itertools import combinations, pairwise, permutations, product
 
 import numpy as np
@@ -8,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from rigidfleet._common.threads import single_blas_thread
 from rigidfleet.formation import assignment, distance_geometry, graphs, shapes
 from rigidfleet.rigidity import RigidityClass, analyse, full_rank, jacobian
 from rigidfleet.rigidity import design as design_module
@@ -61,6 +63,20 @@ def test_long_work_takes_one_thread_of_blas(monkeypatch):
         assert len(threads) > 2
         assert all(each == {1} for each in threads)
         assert of_blas() == {2}
+
+
+def test_threads_of_blas_come_back_when_the_last_one_leaves():
+    """Of two that overlap, the first to leave changes nothing for the other."""
+    with threadpool_limits(2, user_api="blas"):
+        seen = []
+        with ExitStack() as one, ExitStack() as other:
+            for stack in (one, other):
+                stack.enter_context(single_blas_thread())
+            for stack in (one, other):
+                seen.append({x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas"})  # fmt: skip
+                stack.close()
+        seen.append({x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas"})
+    assert seen == [{1}, {1}, {2}]
 
 
 @pytest.mark.long

@@ -346,7 +346,8 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     if form is None:
         raise fault(f"{channel.topic}: its messages are of a form that is not known")
     # The last word of the name of a frame says its axes, those of places on the Earth but where their receiver is.
-    named = re.split(r"[^A-Za-z]|(?<=[a-z])(?=[A-Z])", channel.frame)[-1].lower()
+    words = re.split(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])", channel.frame)
+    named = next(filter(None, reversed(words)), "").lower()
     assumed = form.frame == "geodetic" or named not in ("ned", "enu")
     frame = form.frame if assumed else named
     place = _stack_columns(columns, form.place) * form.units[:3]
@@ -375,7 +376,7 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
         place = enu_of(place, origin)
     else:
         if frame == "enu" and assumed and (words := doubt_about_heights(place[:, 2])):
-            notes.append(f"{words} The name of its frame, {channel.frame!r}, would end in _ned")
+            notes.append(f"{words} The last word of its frame, {channel.frame!r}, would be ned")
         place = turn_to_enu(place, axes)
         if reference is not None:
             origin = origin or (*reference[-1].tolist(),)

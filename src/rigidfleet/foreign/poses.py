@@ -3,8 +3,8 @@
 Sources: the definitions of `geometry_msgs`, `nav_msgs`, `sensor_msgs` and `tf2_msgs` (ROS 2's common_interfaces and
 geometry2), `NamedPoseArray` of motion_capture_tracking_interfaces; CDR: after 4 bytes that say the order of bytes, each
 field is aligned to its size; rosbag2's tables (`rosbag2_storage_sqlite3`); and REP 103: frames are east, north, up, and
-one whose name ends in ``_ned`` is north, east, down. Messages of `px4_msgs` are those of PX4's own logs. Their fields
-differ from version to version: the definition in the recording says where each is.
+one whose name ends with the word ``ned`` is north, east, down. Messages of `px4_msgs` are those of PX4's own logs.
+Their fields differ from version to version: the definition in the recording says where each is.
 """
 
 from __future__ import annotations
@@ -177,9 +177,10 @@ def _read_positions(path: Path, unread: dict[str, str]) -> Iterator[_Place]:
                 from zstandard import ZstdDecompressor
 
                 data = ZstdDecompressor().decompress(data, _MESSAGE)  # noqa: PLW2901
-            if data[:2] not in _ORDERS:
-                raise fault(f"{topic}: is encoded in CDR {data[:2].hex()}, not in plain CDR")
-            layout = _message_layout(definition, _ORDERS[data[:2]]) if own else None
+            if len(data) >= 2 and data[:2] not in _ORDERS:
+                unread[topic] = f"is encoded in CDR {data[:2].hex()}, not in plain CDR"
+                continue
+            layout = _message_layout(definition, _ORDERS.get(data[:2], "<")) if own else None
             if own and layout is None:
                 unread[topic] = f"has messages of {name} whose definition is not understood"
                 continue
@@ -247,6 +248,8 @@ def _message_layout(definition: str, order: _Order) -> np.dtype[Any] | None:
         for k in range(int(count or 1)):
             fields[f"{name}[{k}]" if count else name] = own, at
             at += own.itemsize
+    if not fields:
+        return None
     forms, offsets = zip(*fields.values(), strict=True)
     return np.dtype({"names": [*fields], "formats": forms, "offsets": offsets, "itemsize": at})
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._common.threads import single_blas_thread
 from rigidfleet.math.rigid_body import centred, kabsch
 from rigidfleet.typing import Floats, Ints
 
@@ -185,9 +186,7 @@ def least_squares_assignment(p: Floats, q: Floats) -> Ints:
         orders = np.array(list(permutations(range(n))), dtype=np.int64)
         return orders[near[np.arange(n), orders].sum(axis=1).argmax()]
     if n > _LEAST:
-        from threadpoolctl import threadpool_limits  # takes long to load
-
-        with threadpool_limits(1, user_api="blas"):  # its threads would wait actively
+        with single_blas_thread():
             return order_by_exchanges(p, q)
     from scipy.optimize import linear_sum_assignment
 

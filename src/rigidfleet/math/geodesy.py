@@ -20,7 +20,7 @@ def turn_to_enu(vectors: ArrayLike, axes: str) -> Floats:
     What is not finite along one axis stays there. From "ned" and back is the same.
     """
     along, signs = zip(*(AXES[letter] for letter in axes), strict=True)
-    return np.multiply(vectors, signs)[..., np.argsort(along)]
+    return np.multiply(vectors, signs)[..., np.argsort(along)] + 0.0  # no -0 of what lies at 0
 
 
 def enu_of(geodetic: ArrayLike, origin: Geodetic) -> Floats:

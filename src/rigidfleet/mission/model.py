@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from copy import copy
 from functools import cached_property, wraps
 from hashlib import sha256
-from itertools import zip_longest
 from typing import Any, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -35,7 +34,6 @@ from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
 from rigidfleet.mission.phases import latest_end_of_phases
 from rigidfleet.mission.schema import DRAG, Aborting, Contents, Disturbances
 from rigidfleet.mission.text import parse_toml, text_error
-from rigidfleet.mission.values import AUTO
 from rigidfleet.mission.vehicles import VehicleModel, model_of_vehicle
 from rigidfleet.solids.distance import top_of_solids_below
 from rigidfleet.solids.records import Solids, join_solids
@@ -193,20 +191,18 @@ class Mission(Contents, Shown):
         mission._about = self.file_digests_text
         return mission
 
-    def with_phases(self, phases: list[dict[str, Any]]) -> Self:
+    def with_phases(self, phases: list[dict[str, Any]], *, as_written: bool = False) -> Self:
         """Return the mission with other tables of phases, checked.
 
-        It is written as before if it differs in automatic times alone, which follow from that text.
+        With ``as_written`` its text stays: for phases that follow from it, as they differ in automatic times alone.
 
         Raises
         ------
         MissionError
             With a finding for each error.
         """
-        written, mission = self._data["phases"], self.rewritten(self._data | {"phases": phases})
-        if [
-            _phase_but_times(x, y) for x, y in zip_longest(phases, written, fillvalue={})
-        ] == written:
+        mission = self.rewritten(self._data | {"phases": phases})
+        if as_written:
             mission._data, mission._text = self._data, self._text
         return mission
 
@@ -648,15 +644,6 @@ class Mission(Contents, Shown):
     def on_loss(self) -> Literal["continue", "hold", "land", "abort"]:
         """What the others do when a vehicle or link is lost."""
         return self.all_disturbances.on_loss
-
-
-def _phase_but_times(table: dict[str, Any], written: dict[str, Any]) -> dict[str, Any]:
-    """A table of a phase with automatic times, and those of its points, as they are written."""
-    auto = {key for key, x in written.items() if x == AUTO}
-    places = [[x["position"] for x in one.get("through", ())] for one in (table, written)]
-    if auto and places[0] == places[1]:
-        auto |= {"through"} & written.keys()
-    return table | {key: written[key] for key in auto}
 
 
 def _automatic_damping(mission: Mission, name: str, *lost: int) -> float:

@@ -80,7 +80,7 @@ class PlanSteps:
 
     def __init__(self, steps: Steps, legs: Sequence[Leg], plan: Piecewise | None = None) -> None:
         self.steps, self.legs = steps, legs
-        self.plan = plan or plan_path(legs)
+        self.plan = plan_path(legs) if plan is None else plan
         #: When the plan ends [s], and whether on the ground.
         self.end, self.lands = legs[-1].end, legs[-1].phase.lands
 

@@ -124,7 +124,8 @@ def timed_mission_and_legs(mission: Mission) -> tuple[Mission, list[Leg]]:
         now = leg.planned_end_state
     if changes:  # its times may be known already, while its text has the automatic ones
         tables = mission.to_dict()["phases"]
-        mission = mission.with_phases([x | changes.get(k, {}) for k, x in enumerate(tables)])
+        timed = [x | changes.get(k, {}) for k, x in enumerate(tables)]
+        mission = mission.with_phases(timed, as_written=True)
     return mission, legs
 
 

@@ -39,11 +39,13 @@ def assignment_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         length = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
         clearance = assignment.closest_approach(*planned.path_ends, mission.agents.radius)[0]
         order = tuple((other.assigned_slots[first.formation] + 1).tolist())
+        if (
+            name == "as it is" and length < _SHORT
+        ):  # they are in their slots: there is nothing to compare
+            return
         preflight.assignments[name] = Assignment(order, length, clearance)
     now, short, safe = preflight.assignments.values()
     before, after = now.path_length_m, short.path_length_m
-    if before < _SHORT:  # they are in their slots: there is nothing to compare
-        preflight.assignments.clear()
     if after < (1 - _WORTH) * before - _SHORT:
         text = f'assignment = "shortest" reduces the total path length from {before:.1f} m to {after:.1f} m'
         yield Remark("note", "assignment", text)

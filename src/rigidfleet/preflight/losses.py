@@ -107,6 +107,8 @@ def _wreck_remarks(
 ) -> Iterator[Remark]:
     """Remarks on those left who hit a lost vehicle that falls or lies, at samples of the way after the loss."""
     lost = mission.lost_at <= mission.abandons_at
+    if not lost.any():
+        return
     wrecks, left = wrecks_of(mission, plan_path(legs), lost), np.flatnonzero(~lost)
     radius = mission.fleet.radius[left] - fall_uncertainty(mission).max()
     for planned in way if wrecks else ():

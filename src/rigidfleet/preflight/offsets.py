@@ -33,7 +33,7 @@ from rigidfleet.typing import Floats
 #: Share of an offset from which a limit that it breaks is sure to be.
 _SURE = 0.9
 #: Offsets that do not count [m], and those of an unstable law, from which no place can be told.
-_LEAST, _LOST = 1e-4, 1e3
+_LEAST, _UNBOUNDED = 1e-4, 1e3
 #: Shapes of a phase at which it is computed what edges hold.
 _SHAPES = 16
 #: Share of the damping with which motions count as held: by its integral, the law holds in the end what it holds a bit.
@@ -192,7 +192,7 @@ def _broken_limits_in_words(
     there = Preflight(mission, preflight.formations, preflight.gains, [moved], [moved])
     remarks = [*separation_remarks(mission, there), *downwash_remarks(mission, there)]
     remarks += [*measured_remarks(mission, moved), *obstacle_remarks(mission, there)]
-    if far.max() < _LOST:
+    if far.max() < _UNBOUNDED:
         remarks += area_remarks(mission, there)
     broken = {remark.topic: remark.text for remark in remarks if remark.level == "fails"}
     proved, least = leg.certificate, there.separation

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 #: Quantities that are drawn over time.
 _PANELS = "separation", "clearance", "thrust", "speed", "tracking_error", "constraint"
+#: Of these, those whose axis is logarithmic, and shows no zero.
+_LOGARITHMIC = "tracking_error", "constraint"
 _WIDTHS = (2.6, 0.9)  # of lines, first flight to last: each remains visible under the next
 
 
@@ -43,8 +45,11 @@ def svg_of_time_curves(flights: Sequence[Result], labels: Sequence[str]) -> byte
     """Distances, thrust, speed and errors over time, as far as any flight has them, as an SVG."""
     every = {name: [samples(flight, name).worst for flight in flights] for name in _PANELS}
     known = {name: np.concatenate(x) for name, x in every.items()}
-    # A logarithmic axis shows no zero.
-    shown = [name for name, x in known.items() if x[np.isfinite(x)].any()] or ["speed"]
+    shown = [
+        name
+        for name, x in known.items()
+        if (np.isfinite(x) & ((x != 0.0) | (name not in _LOGARITHMIC))).any()
+    ] or ["speed"]
     with st.apply_style():
         rows = (len(shown) + 1) // 2
         fig = st.blank_figure(st.FIGURE_WIDTH, 0.6 + 1.9 * rows, "constrained")
@@ -52,12 +57,12 @@ def svg_of_time_curves(flights: Sequence[Result], labels: Sequence[str]) -> byte
         for ax, name in zip(axes, shown, strict=False):
             for flight, worst, look in zip(flights, every[name], _line_looks(flights), strict=True):
                 ax.plot(flight.time, worst, **look)
-            q, logarithmic = QUANTITIES[name], name in ("tracking_error", "constraint")
+            q = QUANTITIES[name]
             for limit in dict.fromkeys(x for f in flights for x in distinct_limits(f.mission, q)):
                 st.draw_limit(ax, *limit)
             sense = "least" if q.at_least else "greatest"
             ax.set_title(f"{sense} {q.name_in_words} [{q.display_unit}]", loc="left")
-            if logarithmic:
+            if name in _LOGARITHMIC:
                 ax.set_yscale("log", nonpositive="clip")
                 ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-12))
             elif ax.get_ylim()[0] > 0:

@@ -14,10 +14,10 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from threadpoolctl import threadpool_limits
 
 from rigidfleet._common.arguments import as_numbers
 from rigidfleet._common.renamed import getattr_of_earlier_names
+from rigidfleet._common.threads import single_blas_thread
 from rigidfleet.errors import wrong_type
 from rigidfleet.formation.distance_geometry import dimension, distances
 from rigidfleet.formation.graphs import complete_graph
@@ -42,8 +42,7 @@ _PATIENCE = 60
 _WORTH = 100
 
 
-# Threads of BLAS would wait actively: where other processes run, for up to ten times the processor time.
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@single_blas_thread()
 def design(
     slots: ArrayLike,
     *,

@@ -15,9 +15,8 @@ from contextlib import contextmanager
 from multiprocessing import connection
 from typing import Any
 
-from threadpoolctl import threadpool_limits
-
 from rigidfleet._common.processes import set_python_safe_path
+from rigidfleet._common.threads import single_blas_thread
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.kernel.compiler.levels import runnable_instruction_level
 from rigidfleet.sweep.definition import sweep_of_json
@@ -45,7 +44,7 @@ def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
         words = "Install the same version on all machines"
         raise RigidfleetError(f"it has {flown.version}, and the sweep {version}. {words}.")
     runnable_instruction_level()
-    with threadpool_limits(1, user_api="blas"):  # there is a process for each core
+    with single_blas_thread():  # there is a process for each core
         return fly_runs(flown, runs)
 
 
