@@ -1114,7 +1114,7 @@ def dask(tmp_path, request) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]
 
     There are two workers, without nannies, unless options of each are the parameter.
     """
-    pytest.importorskip("distributed")
+    Client = pytest.importorskip("distributed").Client
     place = tmp_path / "scheduler.json"
     here = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(place)]
     processes = [started(here)]
@@ -1124,6 +1124,9 @@ def dask(tmp_path, request) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]
         for k, more in enumerate(getattr(request, "param", [["--no-nanny"]] * 2)):
             local = ["--local-directory", str(tmp_path / f"worker-{k}")]
             processes.append(started(["worker", address, "--nthreads", "1", *more, *local]))
+        if len(processes) > 1:  # on a busy machine one might fly all before the other is there
+            with Client(address) as client:
+                client.wait_for_workers(len(processes) - 1, timeout=120)
         yield address, processes
     finally:
         for process in reversed(processes):
