@@ -1397,6 +1397,17 @@ def test_another_kind_of_cdr_is_refused(tmp_path):
         read_trajectories(path)
 
 
+@pytest.mark.parametrize("length", [0, 1, 3, 9])
+def test_a_message_that_is_cut_off_is_refused(tmp_path, length):
+    """Be it within its header of four bytes, or behind it."""
+    path = poses_bag(tmp_path / "bag", OF_THREE, plugin="SQLITE3")
+    with closing(sqlite3.connect(path)) as base:
+        base.execute(f"UPDATE messages SET data = substr(data, 1, {length})")
+        base.commit()
+    with pytest.raises(TrajectoryError, match="is cut off"):
+        read_trajectories(path)
+
+
 @pytest.mark.parametrize(
     ("frame", "turned"),
     [("map_ned", True), ("ned", True), ("/uav1/NED", True), ("localNED", True), ("world-ned", True),

@@ -303,9 +303,9 @@ class Verdict(Shown):
     @property
     def praise(self) -> str:
         """The worst values of a flight that passed, in words; "" for another."""
-        by_check = {
-            f.check: f for f in self.checks if f.worst is not None and not self.unkept_checks
-        }
+        if self.unkept_checks:
+            return ""
+        by_check = {f.check: f for f in self.checks if f.worst is not None}
         praise = {name: _PRAISE.get(name, quantity(name).praise) for name in by_check}
         if "thrust_peak" in by_check:
             praise["thrust"] = "{who} comes nearest to its limit, at {worst} of {limit}"

@@ -177,16 +177,18 @@ def _read_positions(path: Path, unread: dict[str, str]) -> Iterator[_Place]:
                 from zstandard import ZstdDecompressor
 
                 data = ZstdDecompressor().decompress(data, _MESSAGE)  # noqa: PLW2901
-            if len(data) >= 2 and data[:2] not in _ORDERS:
+            order = _ORDERS.get(data[:2])
+            if order is None and len(data) >= 2:
                 unread[topic] = f"is encoded in CDR {data[:2].hex()}, not in plain CDR"
                 continue
-            layout = _message_layout(definition, _ORDERS.get(data[:2], "<")) if own else None
+            order = order or "<"  # of one that is cut off, any
+            layout = _message_layout(definition, order) if own else None
             if own and layout is None:
                 unread[topic] = f"has messages of {name} whose definition is not understood"
                 continue
             count[topic] += 1
             try:
-                for who, frame, stamp, numbers in _stamped_positions(kind, layout, data):
+                for who, frame, stamp, numbers in _stamped_positions(kind, layout, order, data):
                     yield f"{topic}{who}", (kind, layout, frame), stamp, received, numbers
             except struct.error:
                 where = f"{topic}: message {count[topic]}"
@@ -255,7 +257,7 @@ def _message_layout(definition: str, order: _Order) -> np.dtype[Any] | None:
 
 
 def _stamped_positions(
-    kind: str, layout: np.dtype[Any] | None, message: bytes
+    kind: str, layout: np.dtype[Any] | None, order: _Order, message: bytes
 ) -> Iterator[tuple[str, str, int, Sequence[float]]]:
     """Body ("" if the topic is of one), frame, stamp [ns] or 0, and numbers of each position in a message."""
     if layout is not None:
@@ -263,7 +265,7 @@ def _stamped_positions(
             raise struct.error
         yield "", "", 0, np.frombuffer(message, layout, 1, 4).item()
         return
-    order, at = _ORDERS[message[:2]], 4
+    at = 4
 
     def read(form: str) -> tuple[Any, ...]:
         """Numbers of one size, from their place on."""

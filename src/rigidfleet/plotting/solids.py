@@ -122,9 +122,8 @@ def area_from_above(triangles: Floats) -> Path:
 
     a, b, c = (flat := triangles[..., :2]).swapaxes(0, 1)
     below = np.linalg.det(np.stack([b - a, c - a], axis=1)) < 0.0
-    flat = np.where(
-        below[:, None, None], flat[:, ::-1], flat
-    )  # all turn left, so that none cuts another out
+    # All turn left, so that none cuts another out.
+    flat = np.where(below[:, None, None], flat[:, ::-1], flat)
     codes = np.tile([Path.MOVETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY], len(flat))
     return Path(flat[:, [0, 1, 2, 0]].reshape(-1, 2), codes)
 
@@ -149,7 +148,7 @@ def draw_obstacle_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     low, high = points.min(axis=0), points.max(axis=0)
     corner = np.array([low, [high[0], low[1]], high])
     for at, share in zip(shape.at, _place_opacities(shape), strict=True):
-        extent = ax.add_patch(PathPatch(Path(corner + at[:2]), **look, alpha=0.0))
+        extent = ax.add_patch(PathPatch(Path(corner + at[:2]), visible=False))
         if not shape.grid:
             opacity = (0.1 if shape.zone else 0.3) * float(share)
             area = area_from_above(shape.surface.triangles + at)

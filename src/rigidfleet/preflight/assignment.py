@@ -39,9 +39,8 @@ def assignment_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
         length = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
         clearance = assignment.closest_approach(*planned.path_ends, mission.agents.radius)[0]
         order = tuple((other.assigned_slots[first.formation] + 1).tolist())
-        if (
-            name == "as it is" and length < _SHORT
-        ):  # they are in their slots: there is nothing to compare
+        # They are in their slots: there is nothing to compare.
+        if name == "as it is" and length < _SHORT:
             return
         preflight.assignments[name] = Assignment(order, length, clearance)
     now, short, safe = preflight.assignments.values()

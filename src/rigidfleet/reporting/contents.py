@@ -62,7 +62,7 @@ def page_contents(
     colours = plotting.agent_colours(len(flights))
     pages = [_flight_data(*each) for each in zip(flights, judged, names, colours, strict=True)]
     if several:
-        own = {
+        parts = {
             "numbers": _number_comparison_table(flights, judged, names),
             "keys": _differing_keys_table(missions, names),
             "overlays": _overlay_pictures(flights, names),
@@ -72,7 +72,7 @@ def page_contents(
         sketch = encode_figure(draw_ground(flights[0], falls), ["svg"])["svg"]
         # The summary, or the trajectory where a summary would be empty, has its own page.
         drawn = plotting.figure_names(flights[0])[1:]
-        own = {
+        parts = {
             "brief": brief.brief_rows(flights[0], judged[0], falls, **more),
             "sketch": _data_url(sketch),
             "figures": [_figure_for_page(flights[0], name) for name in drawn],
@@ -84,7 +84,7 @@ def page_contents(
         "safety": _safety_table(flights, judged, names),
         "version": __version__,
         "covers": _scope_in_words(flights),
-        **own,
+        **parts,
     }
 
 
